@@ -1,0 +1,1 @@
+"""Mechanical models: lumped elements, second-order and first-order forms, sampling, modes, simulation."""
