@@ -1,0 +1,56 @@
+# Everything on a fresh machine with Python 3.11 or newer: `make setup`, `make demo`, `make test`.
+# Choose an interpreter with `make setup PYTHON=/path/to/python`.
+PYTHON ?=
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --benchmark-disable
+
+.PHONY: setup demo lint test test-all bench notebooks clean
+
+setup: $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/jaxsid demo --out demo
+
+lint: $(STAMP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+test: lint
+	$(BIN)/python -m $(CHECKED) -m "not slow"
+
+test-all: lint
+	$(BIN)/python -m $(CHECKED)
+
+bench: $(STAMP)
+	$(BIN)/python -m pytest benchmarks --benchmark-only
+
+notebooks: $(STAMP)
+	$(BIN)/jupyter nbconvert --execute --to html --output-dir build/notebooks notebooks/*.ipynb
+
+clean:
+	rm -rf $(VENV) demo build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
+
+# A name on the PATH may be a shim for a version that is not there, and a system Python may lack venv: try each.
+$(STAMP): pyproject.toml constraints.txt
+	@set -e; \
+	if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  for python in $(or $(PYTHON),python3.13 python3.12 python3.11 python3 python); do \
+	    if $$python -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+	      found=$$python; break; \
+	    fi; \
+	  done; \
+	  if [ -z "$$found" ]; then \
+	    echo "jaxsid needs Python 3.11 or newer with its venv module; none of '$(or $(PYTHON),python3.13 python3.12 python3.11 python3 python)' is one." >&2; \
+	    echo "Install it (on Debian and Ubuntu the package python3-venv too), or name it: make PYTHON=/path/to/python" >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "making $(VENV) with $$($$found --version)"; \
+	  $$found -m venv --clear $(VENV); \
+	fi
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt hatchling editables
+	extras=$$($(BIN)/python -c 'import tomllib; print(",".join(sorted(set(tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]) - {"cuda"})))') && \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -c constraints.txt -e ".[$$extras]"
+	@touch $@

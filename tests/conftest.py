@@ -1,0 +1,41 @@
+"""Shared settings and fixtures: double precision, the data path, a compilation cache."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+# XLA logs an error line for each program read back from the cache, over two tuning flags of its own.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+jax.config.update("jax_enable_x64", True)
+
+# Most of a run is compilation; a second run reads it from this git-ignored folder, which `make clean` removes.
+jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Two workers may meet in a cache file that is half written; JAX then compiles afresh, as it should.
+    config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache")
+
+
+@pytest.fixture
+def single_precision() -> Iterator[None]:
+    """Run the test in float32, as a user who has not switched on double precision does."""
+    with jax.enable_x64(False):
+        yield
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of measured records, which are public but not ours to publish."""
+    folder = Path(os.environ.get("JAXSID_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("measured records not found; name their folder by the environment variable JAXSID_DATA")
+    return folder
