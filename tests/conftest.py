@@ -14,15 +14,10 @@ ROOT = Path(__file__).parents[1]
 
 jax.config.update("jax_enable_x64", True)
 
-# Most of a run is compilation; a second run reads it from this git-ignored folder, which `make clean` removes.
+# Most of a run is compilation; a second run reads it from a git-ignored folder, which `make clean` removes.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    # Two workers may meet in a cache file that is half written; JAX then compiles afresh, as it should.
-    config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache")
 
 
 @pytest.fixture
