@@ -131,7 +131,7 @@ def lumped_model(
         InputError: unknown, reserved or duplicated names, values that no mechanical system has, wrong shapes.
     """
     model = LumpedModel(
-        *(floating(np.asarray(x) if isinstance(x, list | tuple) else x) for x in (mass, stiffness, damping)),
+        *(floating(jnp.asarray(x)) for x in (mass, stiffness, damping)),
         matrices=matrices,
         bodies=tuple(bodies),
         connections=tuple(Connection(c[0], (c[1][0], c[1][1])) for c in connections),
@@ -233,7 +233,7 @@ def _check_elements(model: LumpedModel) -> None:
         values: Array = getattr(model, what)
         require(
             values.shape == (len(names),),
-            f"{model.name}: {len(names)} connections need as many values of {what}, not shape {values.shape}.",
+            f"{model.name}: {len(names)} connections need as many of {what}, not shape {values.shape}.",
         )
         if is_concrete(values):
             require_finite(values, f"{model.name}, {what}", names)
@@ -241,7 +241,7 @@ def _check_elements(model: LumpedModel) -> None:
             if bad.size:
                 value = float(values[bad[0]])
                 bad_input(
-                    f"{model.name}: {what} of '{names[bad[0]]}' must be {limit}, not {value:g}. Check its unit."
+                    f"{model.name}: {what} of '{names[bad[0]]}' must be {limit}, not {value:g}. Check it."
                 )
 
 
