@@ -35,7 +35,7 @@ clean:
 
 # A name on the PATH may be a shim for a version that is not there, and a system Python may lack venv: try each.
 $(STAMP): pyproject.toml constraints.txt
-	@set -e; \
+	@set -e; found=; \
 	if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
 	  for python in $(or $(PYTHON),python3.13 python3.12 python3.11 python3 python); do \
 	    if $$python -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
