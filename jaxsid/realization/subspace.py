@@ -1,0 +1,163 @@
+"""Dominant singular subspaces of an operator, by restarted block Krylov iteration, with their derivative.
+
+The iteration goes on until the residual of the kept singular triplets reaches rounding, so that the answer is
+that of a full singular value decomposition whatever the gap at the cut. Products with the transposed matrix
+are never paired into a Gram matrix, which would lose everything below 1e-8 of the largest singular value.
+Source: Musco and Musco, "Randomized block Krylov methods", NeurIPS 2015; Baglama and Reichel, SIAM J. Sci.
+Comput. 27, 2005 (restarting).
+"""
+
+from functools import partial
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsid.realization.hankel import DenseOperator
+
+RESTARTS = 60
+OVERSAMPLING = 10
+# Residual, in units of eps * the largest singular value, at which iteration stops: that of LAPACK.
+RESIDUAL = 30.0
+CG_STEPS = 300
+
+
+class LinearOperator(Protocol):
+    """Something with products; also a pytree, linear in its array leaves."""
+
+    @property
+    def shape(self) -> tuple[int, int]: ...
+
+    def mv(self, v: Array) -> Array: ...
+
+    def rmv(self, u: Array) -> Array: ...
+
+
+class Subspace(NamedTuple):
+    """Left and right singular vectors (rows, order), (cols, order), and all computed singular values (k,)."""
+
+    left: Float[Array, "rows n"]
+    right: Float[Array, "cols n"]
+    values: Float[Array, " k"]
+
+
+def block_width(shape: tuple[int, int], order: int) -> int:
+    """Columns of a Krylov block: twice the order and some, so that the values after the cut are seen too."""
+    return min(2 * order + OVERSAMPLING, *shape)
+
+
+def small_enough(shape: tuple[int, int], order: int) -> bool:
+    """Whether a full decomposition costs no more than the iteration."""
+    return min(shape) <= 3 * block_width(shape, order)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def dominant_subspace(operator: LinearOperator, order: int, full: bool) -> Subspace:
+    """The leading `order` singular vectors of an operator and the singular values computed on the way.
+
+    Its derivative only rotates kept against discarded directions: it is finite for equal kept singular values
+    and right for everything that does not depend on the basis chosen inside the kept subspaces. Singular
+    values past `order` have derivative zero.
+
+    Args:
+        operator: products with a (rows, cols) matrix.
+        order: vectors to keep.
+        full: decompose the matrix of a DenseOperator.
+    """
+    if full:
+        assert isinstance(operator, DenseOperator)
+        u, s, vt = jnp.linalg.svd(operator.matrix, full_matrices=False)
+        return Subspace(u[:, :order], vt[:order].T, s)
+    return _iterate(operator, order)
+
+
+@dominant_subspace.defjvp
+def _rotate(order: int, full: bool, primals: tuple, tangents: tuple) -> tuple[Subspace, Subspace]:
+    (operator,), (change,) = primals, tangents
+    space = dominant_subspace(operator, order, full)
+    u, v, s = space.left, space.right, space.values[:order]
+    du_v = jax.jvp(lambda op: op.mv(v), (operator,), (change,))[1]
+    dv_u = jax.jvp(lambda op: op.rmv(u), (operator,), (change,))[1]
+    ds = jnp.sum(u * du_v, axis=0)
+    du_v, dv_u = du_v - u @ (u.T @ du_v), dv_u - v @ (v.T @ dv_u)
+
+    def discarded(w: Array) -> Array:
+        w = operator.mv(w - v @ (v.T @ w))
+        return w - u @ (u.T @ w)
+
+    def discarded_transposed(w: Array) -> Array:
+        w = operator.rmv(w - u @ (u.T @ w))
+        return w - v @ (v.T @ w)
+
+    # X S - H_d Z = dH V and Z S - H_d' X = dH' U, with H_d the discarded part: eliminate Z.
+    right_side = (du_v + discarded(dv_u / s)) / s
+    x = _cg(lambda w: w - discarded(discarded_transposed(w)) / s**2, right_side)
+    z = (dv_u + discarded_transposed(x)) / s
+    tail = jnp.zeros_like(space.values[order:])
+    return space, Subspace(x, z, jnp.concatenate([ds, tail]))
+
+
+def _cg(product, right_side: Array) -> Array:
+    """Conjugate gradients on a positive definite operator near the identity."""
+    tol = 10 * float(jnp.finfo(right_side.dtype).eps)
+    return jax.scipy.sparse.linalg.cg(product, right_side, tol=tol, maxiter=CG_STEPS)[0]
+
+
+def _orthonormal(x: Array) -> Array:
+    return jnp.linalg.qr(x)[0]
+
+
+def _orthonormal_against(basis: Array, x: Array) -> Array:
+    """Orthonormal columns orthogonal to the basis; twice, because the remainder may be all rounding."""
+    for _ in range(2):
+        x = _orthonormal(x - basis @ (basis.T @ x))
+    return x
+
+
+def _triplets(basis: Array, products: Array, width: int) -> tuple[Array, Array, Array]:
+    """Leading singular triplets of Q (H' Q)' from an orthonormal Q and H' Q."""
+    z, t = jnp.linalg.qr(products)
+    a, s, bt = jnp.linalg.svd(t.T, full_matrices=False)
+    return basis @ a[:, :width], s[:width], z @ bt[:width].T
+
+
+class _State(NamedTuple):
+    left: Array
+    values: Array
+    right: Array
+    image: Array  # H times right
+    count: Array
+
+
+def _residual(state: _State, order: int) -> Array:
+    """max_i norm(H v_i - s_i u_i) / s_1 over the kept triplets; H' u_i = s_i v_i holds by construction."""
+    error = state.image[:, :order] - state.left[:, :order] * state.values[:order]
+    return jnp.max(jnp.linalg.norm(error, axis=0)) / jnp.maximum(state.values[0], jnp.finfo(error.dtype).tiny)
+
+
+def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
+    """One restart: the Krylov space of two blocks from the images of the last right vectors."""
+    first = _orthonormal(state.image)
+    first_product = operator.rmv(first)
+    second = _orthonormal_against(first, operator.mv(first_product))
+    products = jnp.concatenate([first_product, operator.rmv(second)], axis=1)
+    left, values, right = _triplets(jnp.concatenate([first, second], axis=1), products, width)
+    return _State(left, values, right, operator.mv(right), state.count + 1)
+
+
+def _iterate(operator: LinearOperator, order: int) -> Subspace:
+    cols = operator.shape[1]
+    width = block_width(operator.shape, order)
+    dtype = jax.eval_shape(operator.mv, jax.ShapeDtypeStruct((cols, 1), jnp.result_type(float))).dtype
+    start = jax.random.normal(jax.random.key(0), (cols, width), dtype)
+    basis = _orthonormal(operator.mv(start))
+    left, values, right = _triplets(basis, operator.rmv(basis), width)
+    state = _State(left, values, right, operator.mv(right), jnp.array(0))
+    tolerance = RESIDUAL * jnp.finfo(dtype).eps
+
+    def unfinished(state: _State) -> Array:
+        return (state.count < RESTARTS) & (_residual(state, order) > tolerance)
+
+    state = jax.lax.while_loop(unfinished, lambda st: _expand(operator, st, width), state)
+    return Subspace(state.left[:, :order], state.right[:, :order], state.values)
