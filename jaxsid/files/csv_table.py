@@ -1,5 +1,6 @@
 """CSV: a header row, then numbers; separator and decimal sign are found out, '#' starts a comment."""
 
+import codecs
 import csv
 import re
 import warnings
@@ -53,7 +54,7 @@ def find_layout(path: Path) -> Layout:
     lines = text.splitlines()
     data = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     require(len(data) > 0, f"{path}: holds no header and no data.")
-    separator = max(SEPARATORS, key=lambda s: len(cells(lines[data[0]], s)))
+    separator = find_separator(lines[data[0]], lines[data[1]] if len(data) > 1 else "")
     header = cells(lines[data[0]], separator)
     require(
         not all(is_number(cell) for cell in header),
@@ -85,13 +86,23 @@ def is_number(cell: str) -> bool:
 
 def find_encoding(head: bytes) -> str:
     """UTF-8 unless the bytes say otherwise; spreadsheets also write UTF-16 and the Windows code page."""
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     try:
-        head[: max(len(head) - 4, 0) or None].decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        return "utf-8-sig" if error.end >= len(head) - 4 else "cp1252"
+        codecs.getincrementaldecoder("utf-8-sig")().decode(head)  # which forgives a character cut at the end
+    except UnicodeDecodeError:
+        return "cp1252"
     return "utf-8-sig"
+
+
+def find_separator(header: str, row: str) -> str:
+    """The separator that cuts the header into most cells, and a row into as many: names may hold others."""
+
+    def rank(separator: str) -> tuple[bool, int]:
+        count = len(cells(header, separator))
+        return count > 1 and count == len(cells(row, separator)), count
+
+    return max(SEPARATORS, key=rank)
 
 
 def cells(line: str, separator: str) -> list[str]:
@@ -109,9 +120,7 @@ def read_csv(path: Path, layout: Layout, names: Sequence[str]) -> Columns:
         )
     places = [layout.header.index(name) for name in names]
     try:
-        frame = parse(
-            path, layout, places, dtype=np.float64, decimal=layout.decimal, float_precision="round_trip"
-        )
+        frame = parse(path, layout, places, dtype=np.float64, decimal=layout.decimal)
     except (ValueError, OverflowError) as error:
         blame_cell(path, layout, places)
         raise InputError(f"{path}: cannot be read as CSV: {str(error).strip()}.") from None
@@ -134,8 +143,15 @@ def parse(path: Path, layout: Layout, places: Sequence[int], **options: Any) -> 
             comment="#",
             skipinitialspace=True,
             encoding=layout.encoding,
+            **exact_floats(pd.__version__),
             **options,
         )
+
+
+def exact_floats(version: str) -> dict[str, str]:
+    """The option with which pandas rounds every number correctly; since 3.1 it always does and warns of it."""
+    major, minor = (int(part) for part in version.split(".")[:2])
+    return {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
 
 
 def blame_cell(path: Path, layout: Layout, places: Sequence[int]) -> None:
@@ -145,10 +161,11 @@ def blame_cell(path: Path, layout: Layout, places: Sequence[int]) -> None:
     except ValueError:
         return  # the rows themselves are broken: pandas has said where
     for place in places:
-        text = [cell.strip() if isinstance(cell, str) else "0" for cell in frame[place]]  # NaN: an empty cell
+        # An empty cell is NaN here, and no text to blame.
+        text = [cell.strip() if isinstance(cell, str) else "0" for cell in frame[place]]
         bad = [i for i, cell in enumerate(text) if not is_number(cell.replace(layout.decimal, "."))]
         if bad:
             bad_input(
-                f"{path}: column '{layout.header[place]}', row {bad[0] + 2}: '{text[bad[0]]}' is not a number "
-                f"({len(bad)} such cells in this column). The header is row 1."
+                f"{path}: column '{layout.header[place]}', row {bad[0] + 2}: '{text[bad[0]]}' is not "
+                f"a number ({len(bad)} such cells in this column). The header is row 1."
             )

@@ -58,7 +58,7 @@ def problem(
     if entry["type"] == "missing":
         return f"{place}key '{key}' is missing."
     if entry["type"] == "extra_forbidden":
-        known = list(tables[str(location[0])].model_fields if len(location) > 2 else schema.model_fields)
+        known = list((tables[str(location[0])] if len(location) > 1 else schema).model_fields)
         return f"{place}key '{key}' is unknown.{suggestion(key, known)} Known here: {listing(known)}."
     return f"{place}key '{key}': {entry['msg'].lower()}, but found {entry['input']!r}."
 
