@@ -52,9 +52,9 @@ def discretise(model: ContinuousModel, dt: ArrayLike, *, hold: str | Sequence[st
         InputError: unknown or mixed holds, a sampling interval that is not positive.
     """
     each = check_holds(hold, model.B.shape[1])
-    if is_concrete(jnp.asarray(dt)):
-        require(float(dt) > 0, f"the sampling interval must be positive, not {float(dt):g} s.")
     dt = jnp.asarray(dt, model.A.dtype)
+    if is_concrete(dt):
+        require(float(dt) > 0, f"the sampling interval must be positive, not {float(dt):g} s.")
     matrices = _bilinear(model, dt) if "band" in each else _sample(model, dt, _ramps(each))
     return Realization(*matrices, dt, hold=each)
 
@@ -82,7 +82,7 @@ def _bilinear(model: ContinuousModel, dt: Array) -> tuple[Array, Array, Array, A
 
 
 def continuous(realization: Realization) -> ContinuousModel:
-    """The continuous-time model whose samples these are, the exact inverse of `discretise`, in real arithmetic.
+    """The continuous-time model whose samples these are: undoes `discretise`, in real arithmetic.
 
     A = log(A) / dt, B = phi_1^-1 B / dt (zero) or phi_1^-2 B / dt (first), D less dt C phi_2 B (first); the
     inverse bilinear map for "band". Poles at z = 1 may be repeated and defective (rigid bodies). The relative
@@ -108,9 +108,9 @@ def _check_poles(A: np.ndarray, band: bool) -> None:
     bad = np.abs(z + 1) <= rounding if band else (z.real <= 0) & (np.abs(z.imag) <= rounding * np.abs(z))
     if bad.any():
         raise InsufficientDataError(
-            f"the sampled model has a pole z = {z[bad][0].real:.6g}, at or beyond the Nyquist frequency: no real "
-            "continuous-time model has these samples. Often the order is too high for the data and the pole "
-            "fits noise: lower the order, or sample faster."
+            f"the sampled model has a pole z = {z[bad][0].real:.6g}, at or beyond the Nyquist frequency: "
+            "no real continuous-time model has these samples. Often the order is too high for the data and the "
+            "pole fits noise: lower the order, or sample faster."
         )
 
 
@@ -155,12 +155,10 @@ def laguerre_to_shift(
     Raises:
         InputError: a not inside the unit circle.
     """
-    if is_concrete(jnp.asarray(pole)):
-        require(
-            abs(float(pole)) < 1,
-            f"a Laguerre pole must lie inside the unit circle, not at {float(pole):g}.",
-        )
-    return _moebius(A, B, C, D, jnp.asarray(pole, A.dtype))
+    a = jnp.asarray(pole, A.dtype)
+    if is_concrete(a):
+        require(abs(float(a)) < 1, f"a Laguerre pole must lie inside the unit circle, not at {float(a):g}.")
+    return _moebius(A, B, C, D, a)
 
 
 def shift_to_laguerre(

@@ -24,17 +24,17 @@ class ComplexModes(eqx.Module):
 
 
 def complex_modes(model: SecondOrderModel) -> ComplexModes:
-    """Complex modes with Z^T [[D, M], [M, 0]] Z = I, Z^T [[K, 0], [0, -M]] Z = -L, Z = [X; X L] [thesis 3.28-3.30].
+    """Complex modes: Z^T [[D, M], [M, 0]] Z = I, Z^T [[K, 0], [0, -M]] Z = -L, Z = [X; X L] [3.28-3.30].
 
-    The transpose, not the conjugate: overdamped modes are real, or imaginary where their sign demands it. Damping
-    need not be proportional, and poles may be repeated while they have shapes enough.
+    The transpose, not the conjugate: the shape of an overdamped mode is real, or imaginary where its sign
+    demands it. Damping need not be proportional; poles may be repeated while they have shapes enough.
 
     Args:
         model: symmetric M, D, K, M positive definite.
 
     Raises:
-        InsufficientDataError: a rigid-body motion that neither spring nor damper holds (a defective double pole at
-            zero), or a critically damped mode: there the pencil has fewer shapes than poles and the
+        InsufficientDataError: a rigid-body motion that neither spring nor damper holds (a defective double
+            pole at zero), or a critically damped mode: there the pencil has fewer shapes than poles and the
             normalization does not exist. Meaningless there for traced values.
     """
     concrete = is_concrete(model.mass, model.damping, model.stiffness)
@@ -43,14 +43,14 @@ def complex_modes(model: SecondOrderModel) -> ComplexModes:
     poles, shapes, error = _modes(model)
     if concrete and not float(error) < 1e-3:
         raise InsufficientDataError(
-            "two poles coincide and share one shape (a critically damped mode), so that the complex modes are "
-            "incomplete. Change a damper slightly, or work with a first-order form."
+            "two poles coincide and share one shape (a critically damped mode), so that the complex modes "
+            "are incomplete. Change a damper slightly, or work with a first-order form."
         )
     return ComplexModes(poles, shapes)
 
 
 def _check_held(model: SecondOrderModel) -> None:
-    """Every motion must meet a spring or a damper; judged per unit of mass, relative to the stiffest motion."""
+    """Every motion must meet a spring or a damper; judged per unit of mass, against the stiffest."""
     lower = np.linalg.inv(np.linalg.cholesky(np.asarray(model.mass, float)))
     scaled = [lower @ np.asarray(x, float) @ lower.T for x in (model.stiffness, model.damping)]
     held = np.vstack([x / max(np.abs(x).max(), np.finfo(float).tiny) for x in scaled])
@@ -58,8 +58,8 @@ def _check_held(model: SecondOrderModel) -> None:
     if smallest <= 100 * len(lower) * np.finfo(np.asarray(model.mass).dtype).eps:
         motion = ", ".join(f"{x:.3g}" for x in lower.T @ vectors)
         raise InsufficientDataError(
-            f"the rigid-body motion ({motion}) meets neither spring nor damper: its double pole at zero is defective "
-            "and has no complex modes. Ground it by a spring or a damper, or work with a first-order form."
+            f"the rigid-body motion ({motion}) meets neither spring nor damper: its double pole at zero is "
+            "defective and has no complex modes. Ground it by a spring or a damper, or use a first-order form."
         )
 
 
@@ -80,30 +80,23 @@ def _modes(model: SecondOrderModel) -> tuple[Array, Array, Array]:
     equal = jnp.abs(poles - poles[:, None]) <= close
     shapes = shapes @ _inverse_root(jnp.where(equal, pencil(shapes), 0.0), equal)
     # rounding must not make a pair lose its symmetry
-    second = jnp.arange(len(poles)) > jnp.argmax(_conjugates(poles), axis=1)
-    partner = jnp.argmax(_conjugates(poles), axis=1)
-    shapes = jnp.where(second & (poles.imag < 0), shapes[:, partner].conj(), shapes)
+    second = (poles.imag < 0) & (poles == jnp.roll(poles, 1).conj())
+    shapes = jnp.where(second, jnp.roll(shapes, 1, axis=1).conj(), shapes)
     error = jnp.max(jnp.abs(pencil(shapes) - jnp.eye(len(poles))))
     return poles, shapes, error
 
 
-def _conjugates(poles: Array) -> Bool[Array, "n n"]:
-    """Where the neighbour of a pole is its conjugate."""
-    near = jnp.abs(jnp.arange(len(poles)) - jnp.arange(len(poles))[:, None]) == 1
-    return near & (poles.conj() == poles[:, None])
-
-
 def _inverse_root(gram: Array, equal: Array) -> Array:
-    """T with T^T gram T = I for a complex symmetric, block-diagonal Gram matrix, one block for each distinct pole.
+    """T with T^T gram T = I for a complex symmetric, block-diagonal Gram matrix, one block a distinct pole.
 
-    A lone pole needs a square root only. For a repeated one the Denman-Beavers iteration gives gram^-1/2, which is
-    symmetric; a phase keeps its eigenvalues off the negative real axis.
+    A lone pole needs a square root only. For a repeated one the Denman-Beavers iteration gives gram^-1/2,
+    which is symmetric; a phase keeps its eigenvalues off the negative real axis.
     """
     size = len(gram)
-    eye = jnp.eye(size)
+    eye = jnp.eye(size, dtype=gram.dtype)
     alone = equal.sum(1) == 1
     own = jnp.sqrt(jnp.diagonal(gram))
-    phase = jnp.exp(0.7j)
+    phase = jnp.exp(jnp.asarray(0.7j, gram.dtype))
     block = jnp.where(alone[:, None] | alone, eye, gram * phase)
     scale = jnp.sqrt(jnp.abs(jnp.trace(block @ block.conj().T)) / size)
     block = jnp.where(alone[:, None] | alone, eye, block / scale)
@@ -119,7 +112,7 @@ def _inverse_root(gram: Array, equal: Array) -> Array:
 
 
 def is_proportional(model: SecondOrderModel, *, tolerance: float = 1e-9) -> Bool[Array, ""]:
-    """Whether the damping leaves the modes real: K M^-1 D symmetric (Caughey and O'Kelly, J. Appl. Mech. 32, 1965).
+    """Whether the damping leaves the modes real: K M^-1 D symmetric (Caughey, J. Appl. Mech. 32, 1965).
 
     Args:
         model: symmetric M, D, K, M positive definite.
