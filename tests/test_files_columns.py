@@ -81,6 +81,11 @@ def test_a_short_or_long_row_is_named(tmp_path):
     assert all(part in text for part in ("run.csv", "row 2", "decimal sign")), text
 
 
+def test_columns_cut_by_spaces_are_refused(tmp_path):
+    text = message(write_text(tmp_path, csv_text(signals(), " ")))
+    assert all(part in text for part in ("run.csv", "row 1", "comma, semicolon or tab")), text
+
+
 def test_a_bad_value_of_a_mat_file_is_named_by_sample(tmp_path):
     data = signals()
     data["acc2"][6] = np.nan

@@ -58,8 +58,12 @@ def find_layout(path: Path) -> Layout:
     header = cells(lines[data[0]], separator)
     require(
         not all(is_number(cell) for cell in header),
-        f"{path}: row 1 holds numbers only, {header[:3]}. The first row must name the columns, 'time' "
-        "among them.",
+        f"{path}: row 1 holds numbers only, {header[:3]}. The first row, comments apart, must name the "
+        "columns, 'time' among them.",
+    )
+    require(
+        len(header) > 1,
+        f"{path}: row 1 is not cut into columns: {header[0]!r}. Separate them by comma, semicolon or tab.",
     )
     require(len(data) > 1, f"{path}: holds no rows of data below the header.")
     first = cells(lines[data[1]], separator)
@@ -149,7 +153,7 @@ def parse(path: Path, layout: Layout, places: Sequence[int], **options: Any) -> 
 
 
 def exact_floats(version: str) -> dict[str, str]:
-    """The option with which pandas rounds every number correctly; since 3.1 it always does and warns of it."""
+    """The option with which pandas rounds every number correctly; since 3.1 it always does."""
     major, minor = (int(part) for part in version.split(".")[:2])
     return {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
 
