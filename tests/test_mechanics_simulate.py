@@ -135,7 +135,7 @@ def test_every_length_of_markov_parameters(samples):
 
 @pytest.mark.parametrize("model", [chain(), rig()], ids=["chain", "rig"])
 def test_band_limited_input_inside_the_record(model):
-    """A smooth pulse, zero at both ends, is its own band-limited interpolation: compare with a 50 times finer grid."""
+    """A smooth pulse, zero at both ends, is its own band-limited interpolation: compare with finer grids."""
     m, dt, fine = continuous_of(model), 0.02, 50
     r = m.B.shape[1]
 
@@ -153,7 +153,7 @@ def test_band_limited_input_inside_the_record(model):
 
 
 def test_band_limited_harmonic_with_initial_state_and_rigid_body():
-    """cos(w t) on a free mass: x = x0 + v0 t + (1 - cos(w t)) / w^2; the ends are what the record cannot tell."""
+    """cos(w t) on a free mass: x = x0 + v0 t + (1 - cos(w t)) / w^2; the ends are unknown."""
     model = lumped_model(
         "a", [1.0], inputs=[Input("f", "a", "band")], sensors=[Sensor("x", "a", "displacement")]
     )
@@ -224,7 +224,7 @@ def test_hold_of_the_record_or_of_the_model_counts():
 def test_clear_errors():
     model, u = chain(), noise(10, 3)
     m = continuous_of(model)
-    with pytest.raises(InputError, match="input 'fc' is missing"):
+    with pytest.raises(InputError, match="input 'fc' of the model is missing"):
         simulate(model, {"fa": u[:, 0], "fb": u[:, 1]}, dt=0.1)
     with pytest.raises(InputError, match="models with effects"):
         effect = Effect("coulomb_friction", (("between", ("a", "b")),), {"force": jnp.asarray(1.0)})

@@ -21,7 +21,8 @@ def extend(u: Float[Array, "samples inputs"]) -> Float[Array, "period inputs"]:
     length = min(len(u) - 1, 512)
     if length < 2:
         return u
-    fade = (1 + np.cos(np.pi * np.arange(1, length + 1) / (length + 1)))[:, None] / 2
+    angle = np.pi * np.arange(1, length + 1) / (length + 1)
+    fade = ((1 + np.cos(angle)) / 2).astype(u.dtype)[:, None]
     tail = (2 * u[-1] - u[-2 : -length - 2 : -1]) * fade
     head = (2 * u[0] - u[length:0:-1]) * fade[::-1]
     return jnp.concatenate([u, tail, head])
@@ -70,7 +71,7 @@ def band_response(
     zero = jnp.zeros((1, len(model.C)), outputs.dtype)
     steady = jnp.fft.irfft(jnp.concatenate([zero, outputs]), period, axis=0)[: len(u)]
     # the Nyquist bin of an even period counts once, and its real part only
-    weights = jnp.full(len(frequencies) - 1, 2.0).at[-1].set(2.0 if period % 2 else 1.0)
+    weights = jnp.full(len(frequencies) - 1, 2.0, u.dtype).at[-1].set(2.0 if period % 2 else 1.0)
     start = state - (weights @ states.real) / period
     one, _ = phi_functions(model.A * dt)
     constant = jnp.broadcast_to(periodic.mean(0), u.shape)

@@ -4,6 +4,8 @@ A sampled mechanical system has A = exp(L) with L of 1e-3 or less: all of its po
 everything here works with phi_1(L) = (exp(L) - I) / L and with E = A - I, subtracting no more than once.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +38,7 @@ def balance(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
         return log + jnp.where(linked, jnp.log(jnp.where(linked, rows / cols, 1.0)) / 4, 0.0)
 
     log = lax.fori_loop(0, 20, step, jnp.zeros(len(off), off.dtype))
-    return jnp.exp2(jnp.round((log - log.mean()) / np.log(2)))
+    return jnp.exp2(jnp.round((log - log.mean()) / math.log(2)))
 
 
 def phi_functions(L: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:

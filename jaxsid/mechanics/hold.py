@@ -108,8 +108,8 @@ def _check_poles(A: np.ndarray, band: bool) -> None:
     bad = np.abs(z + 1) <= rounding if band else (z.real <= 0) & (np.abs(z.imag) <= rounding * np.abs(z))
     if bad.any():
         raise InsufficientDataError(
-            f"the sampled model has a pole z = {z[bad][0].real:.6g}, at or beyond the Nyquist frequency: "
-            "no real continuous-time model has these samples. Often the order is too high for the data and the "
+            f"the sampled model has a pole z = {z[bad][0].real:.6g}, at or beyond the Nyquist frequency: no "
+            "real continuous-time model has these samples. Often the order is too high for the data and the "
             "pole fits noise: lower the order, or sample faster."
         )
 

@@ -59,7 +59,7 @@ def _check_held(model: SecondOrderModel) -> None:
         motion = ", ".join(f"{x:.3g}" for x in lower.T @ vectors)
         raise InsufficientDataError(
             f"the rigid-body motion ({motion}) meets neither spring nor damper: its double pole at zero is "
-            "defective and has no complex modes. Ground it by a spring or a damper, or use a first-order form."
+            "defective and has no complex modes. Ground it by a spring or damper, or use a first-order form."
         )
 
 

@@ -36,7 +36,7 @@ class InitialState(eqx.Module):
             return None
         return (
             f"{int(self.unobservable)} of {len(self.state)} directions of the initial state leave no trace in "
-            "the outputs, such as the position of a free body seen by velocity sensors; they were set to zero."
+            "the outputs, such as the position of a free body seen by velocity sensors; left at zero."
         )
 
 
@@ -51,9 +51,9 @@ def simulate_linear(
     """Outputs at the sampling instants, exact for the hold: y_k = C x_k + D u_k.
 
     A continuous-time model starts from x(0) = initial_state at the first sample. A realization runs as the
-    recursion it is; one with hold "band" is first taken back to continuous time (`continuous`), whose state
-    `initial_state` then is. For "band" the input is the trigonometric interpolation of the record, continued at
-    both ends by odd reflections that fade out over up to 512 samples: what the record cannot tell, its input
+    recursion it is; one with hold "band" is first taken back to continuous time (`continuous`), and
+    `initial_state` is the state there. For "band" the input is the trigonometric interpolation of the record, continued
+    at both ends by odd reflections that fade out over up to 512 samples: what the record cannot tell, its input
     before and after, matters within a few samples of the ends.
 
     Args:
@@ -170,7 +170,7 @@ def _checked_outputs(C: Array, u: ArrayLike, y: ArrayLike) -> Array:
 
 @eqx.filter_jit
 def _fit_state(A: Array, C: Array, residual: Array) -> InitialState:
-    """Least squares on C A^k x_0 = residual_k with columns of equal norm; directions under 1e-8 are left at zero."""
+    """Least squares on C A^k x_0 = residual_k, columns of equal norm; directions under 1e-8 stay zero."""
     free = jnp.swapaxes(powers(A.T, C.T, len(residual)), 1, 2)
     known = jnp.isfinite(residual)
     system = jnp.where(known[:, :, None], free, 0.0).reshape(-1, len(A))
@@ -200,7 +200,7 @@ def simulate(
         record: a Record, its inputs in any order, those that the model does not have unused; or a mapping
             from input names to (samples,) arrays.
         dt: sampling interval, s; with a mapping only.
-        initial: "rest", or "estimate" to fit the initial state, hidden states included, to the record's sensors.
+        initial: "rest", or "estimate" to fit the initial state, hidden states too, to the record's sensors.
 
     Raises:
         InputError: an input is missing, holds contradict, the model has effects, there is nothing to fit to.
@@ -239,7 +239,8 @@ def _inputs(model: LumpedModel, record: Record) -> tuple[Array, tuple[str, ...]]
     for wanted in model.inputs:
         require(
             wanted.name in record.inputs,
-            f"{record.name}: the model's input '{wanted.name}' is missing; there is {', '.join(record.inputs)}.",
+            f"{record.name}: input '{wanted.name}' of the model is missing; it has "
+            f"{', '.join(record.inputs)}.",
         )
         order.append(record.inputs.index(wanted.name))
         said = {h for h in (wanted.hold, record.hold[order[-1]]) if h != "zero"}
