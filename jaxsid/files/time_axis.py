@@ -130,7 +130,7 @@ def best_line(time: np.ndarray) -> tuple[float, np.ndarray]:
     """Slope of the least-squares line through the samples, and their distances from it."""
     centred = np.arange(len(time)) - (len(time) - 1) / 2
     deviation = time - time.mean()
-    slope = float(centred @ deviation / (centred @ centred))
+    slope = float((centred * deviation).sum() / (centred * centred).sum())
     return slope, deviation - slope * centred
 
 

@@ -40,8 +40,8 @@ def checked(
         return schema.model_validate(data)
     except ValidationError as error:
         lines = [problem(dict(entry), data, schema, tables) for entry in error.errors()]
-        text = lines[0] if len(lines) == 1 else "".join(f"\n  - {line}" for line in lines)
-        bad_input(f"{path}: {text}")
+        text = f" {lines[0]}" if len(lines) == 1 else "".join(f"\n  - {line}" for line in lines)
+        bad_input(f"{path}:{text}")
 
 
 def problem(
@@ -60,6 +60,10 @@ def problem(
     if entry["type"] == "extra_forbidden":
         known = list((tables[str(location[0])] if len(location) > 1 else schema).model_fields)
         return f"{place}key '{key}' is unknown.{suggestion(key, known)} Known here: {listing(known)}."
+    if entry["type"] == "list_type" and key in tables:
+        return (
+            f"{place}key '{key}': there may be several, so write [[{key}]], in double brackets, above each."
+        )
     return f"{place}key '{key}': {entry['msg'].lower()}, but found {entry['input']!r}."
 
 
