@@ -71,9 +71,9 @@ def test_all_forms_have_the_transfer_function_of_the_second_order_model(name):
             G = C @ np.linalg.solve(s * np.eye(len(A)) - A, B) + d
             for kind in range(3):
                 part = slice(kind * len(M), (kind + 1) * len(M))
-                np.testing.assert_allclose(
-                    G[part], truth[part], atol=2e-12 * np.abs(truth[part]).max(), rtol=0
-                )
+                # slow accelerations are the feedthrough less nearly all of it
+                scale = max(np.abs(truth[part]).max(), np.abs(d[part]).max())
+                np.testing.assert_allclose(G[part], truth[part], atol=tolerance * scale, rtol=0)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

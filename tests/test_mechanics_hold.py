@@ -69,15 +69,14 @@ def test_defective_double_pole_at_zero_comes_back_exactly():
 
 
 def test_poles_near_the_nyquist_frequency_come_back():
-    s = np.array([-0.01 + 3.1j, -0.3 + 2.5j, -17.0])
+    s = np.array([-0.01 + 3.1j, -0.3 + 2.5j, -6.0])
     A = scipy.linalg.block_diag(*([[p.real, p.imag], [-p.imag, p.real]] for p in s[:2]), s[2].real)
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(5, 5)))[0]
     A = turn @ A @ turn.T
     m = ContinuousModel(*(jnp.asarray(x) for x in (A, np.ones((5, 1)), np.ones((1, 5)), np.zeros((1, 1)))))
     back = np.linalg.eigvals(np.asarray(continuous(discretise(m, 1.0)).A))
-    assert np.abs(back - s[0]).min() < 1e-10
-    assert np.abs(back - s[1]).min() < 1e-10
-    assert np.abs(back - s[2]).min() < 1e-7  # e^-17 of a matrix of norm 1 has eight digits left
+    for pole in s:
+        assert np.abs(back - pole).min() < 1e-10
 
 
 def test_random_realization_has_scipys_logarithm():
@@ -91,7 +90,8 @@ def test_random_realization_has_scipys_logarithm():
 def test_phi_functions_against_scipy():
     rng = np.random.default_rng(3)
     for size in (1e-8, 0.1, 5.0, 40.0):
-        L = size * (rng.normal(size=(5, 5)) - 2 * np.eye(5))
+        S = rng.normal(size=(5, 5))
+        L = size * (S - S.T - np.eye(5))  # normal, so that its exponential is well conditioned
         zero, eye = np.zeros((5, 5)), np.eye(5)
         big = scipy.linalg.expm(np.block([[L, eye, zero], [zero, zero, eye], [zero, zero, zero]]))
         one, two = jax.jit(phi_functions)(L)

@@ -35,8 +35,8 @@ class InitialState(eqx.Module):
         if int(self.unobservable) == 0:
             return None
         return (
-            f"{int(self.unobservable)} of {len(self.state)} directions of the initial state leave no trace in "
-            "the outputs, such as the position of a free body seen by velocity sensors; left at zero."
+            f"{int(self.unobservable)} of {len(self.state)} directions of the initial state leave no trace "
+            "in the outputs, such as the position of a free body seen by velocity sensors; left at zero."
         )
 
 
@@ -51,10 +51,10 @@ def simulate_linear(
     """Outputs at the sampling instants, exact for the hold: y_k = C x_k + D u_k.
 
     A continuous-time model starts from x(0) = initial_state at the first sample. A realization runs as the
-    recursion it is; one with hold "band" is first taken back to continuous time (`continuous`), and
-    `initial_state` is the state there. For "band" the input is the trigonometric interpolation of the record, continued
-    at both ends by odd reflections that fade out over up to 512 samples: what the record cannot tell, its input
-    before and after, matters within a few samples of the ends.
+    recursion it is; one with hold "band" is first taken back to continuous time by `continuous`, and
+    `initial_state` is the state there. For "band" the input is the trigonometric interpolation of the
+    record, continued at both ends by odd reflections that fade out over up to 512 samples: what the record
+    cannot tell, its input before and after, matters within a few samples of the ends.
 
     Args:
         model: a continuous-time model, or a realization, which has its own interval and hold.
