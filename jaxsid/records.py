@@ -80,7 +80,7 @@ class ImpulseResponse(eqx.Module):
 
     With a `pole` a other than zero the samples are Markov parameters in the Laguerre shift
     w = (z - a) / (1 - a z) instead of z: G(z) = sum_k h_k w^-k. It resolves a band far below
-    the sampling rate without decimating. `time_response` turns it into ordinary time samples.
+    the sampling rate without decimating.
 
     Attributes:
         h: (samples, outputs, inputs), h[0] the feedthrough.
@@ -250,10 +250,12 @@ class CbsiDiagnostics(eqx.Module):
     """How consistent a realization is with M q'' + D q' + K q = B u; every entry is 0 for a perfect one.
 
     Attributes:
-        upper_block_error: distance of the upper half of A_I from [0, I], relative.
-        feedthrough_error: distance of the upper half of B_I from 0, relative to the lower half.
+        upper_block_error: displacement sensors moved at once by a force, C B, against M^-1 B_u / norm(A): the
+            upper half of B_I, which is zero when that of A_I is [0, I].
+        feedthrough_error: feedthrough D less M^-1 B_u for accelerometers, or less 0 for others, relative.
         mass_asymmetry, damping_asymmetry, stiffness_asymmetry: norm(X - X') / norm(X + X').
-        negative_scales: number of negative s_i^2, each a mode whose driving point contradicts its shape.
+        negative_scales: number of negative s_i^2 (by Sylvester's law, of negative eigenvalues of M^-1), each a
+            mode whose driving point contradicts its shape.
     """
 
     upper_block_error: Float[Array, ""]

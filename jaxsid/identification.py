@@ -1,0 +1,84 @@
+"""What `identify` finds: one immutable value that the report, the JSON and the model file are written from."""
+
+import equinox as eqx
+from jaxtyping import Array, Complex, Float
+
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.realization.stabilization import Stabilization
+from jaxsid.records import ContinuousModel, ImpulseResponse, ModalModel, Realization, Record, SecondOrderModel
+
+
+class MatrixDeviation(eqx.Module):
+    """Standard deviation of every entry of mass, damping and stiffness, (N, N) each."""
+
+    mass: Float[Array, "N N"]
+    damping: Float[Array, "N N"]
+    stiffness: Float[Array, "N N"]
+
+
+class FrequencyFit(eqx.Module):
+    """Measured and modelled frequency response of one record, acceleration, velocity or displacement per force.
+
+    Attributes:
+        frequencies: (lines,) Hz.
+        measured: (lines, outputs, inputs), NaN where it was not measured.
+        coherence: (lines, outputs) multiple coherence, NaN likewise.
+        realization: (lines, outputs, inputs) of the identified state-space model.
+        matrices: (lines, outputs, inputs) of the identified mass, damping and stiffness; None without them.
+    """
+
+    frequencies: Float[Array, " lines"]
+    measured: Complex[Array, "lines outputs inputs"]
+    coherence: Float[Array, "lines outputs"]
+    realization: Complex[Array, "lines outputs inputs"]
+    matrices: Complex[Array, "lines outputs inputs"] | None
+
+
+class Identification(eqx.Module):
+    """Everything that was identified from the records of one system.
+
+    Attributes:
+        nominal: the model that the user gave.
+        records: what was measured.
+        outputs: names of the outputs of all results below, the model's sensors that some record holds.
+        response: estimated impulse response, in the Laguerre shift where its pole is not 0.
+        time_response: (samples, outputs, inputs) impulse response of the realization, at the interval of the records.
+        realization: discrete-time state-space model.
+        continuous: the same in continuous time.
+        order: number of states.
+        order_reason: why this order, in words.
+        stabilization: poles over orders.
+        modal: poles, shapes and indicators.
+        frequency_std, damping_ratio_std: (n,) standard deviations of frequencies (rad/s) and damping ratios.
+        cbsi: mass, damping and stiffness by CBSI alone; None where impossible.
+        matrices: mass, damping and stiffness, symmetric, that fit the records best; None where impossible.
+        matrices_std: their standard deviations.
+        identified: `matrices` as a model file; None where impossible.
+        predictions: response of the identified model to each record's inputs, initial state estimated.
+        train_nrmse, noise_floor: (outputs,) rms(y - yhat) / std(y), and what pure noise would leave.
+        frequency_fit: measured and modelled frequency responses, one a record.
+        warnings: what the user should know.
+    """
+
+    nominal: LumpedModel
+    records: tuple[Record, ...]
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    response: ImpulseResponse
+    time_response: Float[Array, "samples outputs inputs"]
+    realization: Realization
+    continuous: ContinuousModel
+    order: int = eqx.field(static=True)
+    order_reason: str = eqx.field(static=True)
+    stabilization: Stabilization
+    modal: ModalModel
+    frequency_std: Float[Array, " n"]
+    damping_ratio_std: Float[Array, " n"]
+    cbsi: SecondOrderModel | None
+    matrices: SecondOrderModel | None
+    matrices_std: MatrixDeviation | None
+    identified: LumpedModel | None
+    predictions: tuple[Float[Array, "samples outputs"], ...]
+    train_nrmse: Float[Array, " outputs"]
+    noise_floor: Float[Array, " outputs"]
+    frequency_fit: tuple[FrequencyFit, ...]
+    warnings: tuple[str, ...] = eqx.field(static=True)

@@ -1,0 +1,174 @@
+"""Maximum-likelihood refinement of a realization against the in-band lines of its records.
+
+With the poles given, residues, feedthrough and the transients of every record enter linearly, so only the
+poles are searched: variable projection. Poles enter in pairs through w^2 + a_1 w + a_2, which crosses from
+complex to real without a break, so overdamped modes need no special care:
+    min sum_k |V_i(k) (Y_i(k) - sum_q (R_q + S_q w_k) / (w_k^2 + a_1q w_k + a_2q) [U(k); 1] - E [U(k); 1])|^2
+    ,
+the weights V_i(k) being one over the noise level of output i around line k, found from the residual.
+
+Source: G. Golub and V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
+whose variables separate", SIAM J. Numer. Anal. 10 (1973), with L. Kaufman's simplification (BIT 15, 1975).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from jaxsid.impulse.lines import Lines, laguerre_shift
+from jaxsid.least_squares import levenberg_marquardt
+from jaxsid.realization.era import era
+from jaxsid.records import ImpulseResponse, Realization
+
+STEPS = 30
+NEIGHBOURS = 24  # lines on either side over which the noise spectrum is averaged
+
+
+class Polished(NamedTuple):
+    """A refined realization and what the records left over.
+
+    Attributes:
+        realization: of the same order and Laguerre pole as the one it started from.
+        noise: (lines, outputs) standard deviation of the noise on each line, smoothed over frequency.
+        residual: (lines, outputs) what remains of each line.
+        transient: (lines, outputs) the part of each line due to the initial and final states.
+        pole_covariance: (n, n) covariance of the denominator coefficients.
+    """
+
+    realization: Realization
+    noise: Float[Array, "lines outputs"]
+    residual: Complex[Array, "lines outputs"]
+    transient: Complex[Array, "lines outputs"]
+    pole_covariance: Float[Array, "n n"]
+
+
+def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polished:
+    """A realization of the same order whose poles, residues and transients fit the lines best.
+
+    Args:
+        realization: start; only its poles are used.
+        lines: in-band lines of the records.
+        rounds: how often the noise spectrum is estimated anew and the fit repeated.
+    """
+    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(realization.pole)))
+    noise, pole = _level(lines.y, lines.weight), realization.pole
+    noise = jnp.broadcast_to(jnp.sqrt((noise**2).mean(axis=0)), noise.shape)
+    for _ in range(rounds + 1):
+        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole)
+    samples = max(4 * len(theta) + 2, 200)
+    h = _markov_parameters(theta, response[:, : lines.u.shape[1]], samples)
+    ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="polished in band")
+    refined = era(ir, order=len(theta), rows=samples // 2 - 1, cols=samples // 2 - 1)
+    return Polished(refined, noise, residual, transient, covariance)
+
+
+def _denominators(A: np.ndarray, pole: float) -> np.ndarray:
+    """Coefficients a_1, a_2 of each pole pair in the shift w, then the odd real pole if there is one."""
+    eigenvalues = np.linalg.eigvals(A)
+    eigenvalues = laguerre_shift(eigenvalues, pole)
+    above = eigenvalues[eigenvalues.imag > 1e-12]
+    real = list(np.sort(eigenvalues[np.abs(eigenvalues.imag) <= 1e-12].real))
+    pairs = [(-2 * p.real, abs(p) ** 2) for p in above]
+    while len(real) > 1:  # slowest with fastest, so that no pair starts as a double pole
+        low, high = real.pop(0), real.pop()
+        pairs.append((-(low + high), low * high))
+    return np.concatenate([np.ravel(pairs), [-p for p in real]])
+
+
+def _sections(theta: Array, w: Array) -> Array:
+    """Basis of the partial fractions at points w: w/q and 1/q for each pair, 1/(w - p), and 1."""
+    pairs = len(theta) // 2
+    a1, a2 = theta[: 2 * pairs].reshape(pairs, 2).T
+    inverse = 1 / (w[:, None] ** 2 + a1 * w[:, None] + a2)
+    single = 1 / (w[:, None] + theta[2 * pairs :])
+    return jnp.concatenate([inverse * w[:, None], inverse, single, jnp.ones((len(w), 1))], axis=1)
+
+
+def _design(theta: Array, lines: Lines, pole: Array) -> Array:
+    """Every section driven by every input, and by the unit line spectrum of each record's transient."""
+    drive = jnp.concatenate([lines.u, lines.record], axis=1)
+    sections = _sections(theta, laguerre_shift(lines.z, pole))
+    return (sections[:, :, None] * drive[:, None, :]).reshape(len(drive), -1)
+
+
+def _weighted(x: Array, weight: Array) -> Array:
+    """Real and imaginary parts, one weight a line."""
+    x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
+    return jnp.concatenate([x.real, x.imag])
+
+
+def _projected_residual(theta: Array, args: tuple[Lines, Array, Array]) -> Array:
+    """Weighted residual with all linear coefficients eliminated; its derivative is Kaufman's."""
+    lines, noise, pole = args
+    design = _design(theta, lines, pole)
+
+    def one_output(y: Array, weight: Array) -> Array:
+        q, _, coefficients = jax.lax.stop_gradient(_solve(design, y, weight))
+        left = _weighted(y - design @ coefficients, weight)
+        return left - q @ (q.T @ left)
+
+    weight = lines.weight * jnp.sqrt(2.0) / noise
+    return jax.vmap(one_output, in_axes=1)(lines.y, weight)
+
+
+def _solve(design: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """QR factors and least-squares coefficients of one output, columns scaled to unit norm."""
+    weighted = _weighted(design, weight)
+    scale = jnp.linalg.norm(weighted, axis=0)
+    scale = jnp.where(scale > 0, scale, 1.0)
+    q, triangle = jnp.linalg.qr(weighted / scale)
+    diagonal = jnp.diag(triangle)
+    dead = jnp.abs(diagonal) < 1e-13 * jnp.abs(diagonal).max()
+    triangle = triangle + jnp.diag(jnp.where(dead, 1e300, 0.0).astype(triangle.dtype))
+    x = jax.scipy.linalg.solve_triangular(triangle, q.T @ _weighted(y, weight))
+    return q, triangle, x / scale
+
+
+@eqx.filter_jit
+def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, ...]:
+    """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
+    args = (lines, noise, pole)
+    found = levenberg_marquardt(lambda t: _projected_residual(t, args), theta, max_steps=STEPS)
+    theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
+    design = _design(theta, lines, pole)
+    weight = lines.weight / noise
+    response = jax.vmap(lambda y, v: _solve(design, y, v)[2], in_axes=1, out_axes=1)(lines.y, weight)
+    residual = (lines.y - design @ response) * lines.weight
+    inputs, records = lines.u.shape[1], lines.record.shape[1]
+    response = response.reshape(-1, inputs + records, lines.y.shape[1])
+    sections = _sections(theta, laguerre_shift(lines.z, pole))
+    transient = jnp.einsum("ks,kr,srm->km", sections, lines.record, response[:, inputs:])
+    return theta, _level(residual, lines.weight), response, residual, transient, covariance
+
+
+def _level(x: Array, weight: Array) -> Array:
+    """Root of the mean square over the neighbouring lines, (lines, outputs), never below 1e-12 of the largest."""
+    count = len(x)
+    low = jnp.maximum(jnp.arange(count) - NEIGHBOURS, 0)
+    high = jnp.minimum(jnp.arange(count) + NEIGHBOURS + 1, count)
+
+    def average(v: Array) -> Array:
+        total = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(v, axis=0)])
+        return total[high] - total[low]
+
+    power = average(jnp.abs(x) ** 2 * weight) / jnp.maximum(average(weight), 1.0)
+    return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
+
+
+def _markov_parameters(theta: Array, response: Array, samples: int) -> Array:
+    """Markov parameters in the shift w of the partial fractions, (samples, outputs, inputs)."""
+    pairs = len(theta) // 2
+    a1, a2 = theta[: 2 * pairs].reshape(pairs, 2).T
+
+    def step(state: Array, _: None) -> tuple[Array, Array]:
+        first, second, single = state[:pairs], state[pairs : 2 * pairs], state[2 * pairs :]
+        return jnp.concatenate([-a1 * first - a2 * second, first, -theta[2 * pairs :] * single]), state
+
+    start = jnp.concatenate([jnp.ones(pairs), jnp.zeros(pairs), jnp.ones(len(theta) - 2 * pairs)])
+    states = jax.lax.scan(step, start, None, length=samples - 1)[1]
+    h = jnp.einsum("ks,srm->kmr", states, response[:-1])
+    return jnp.concatenate([response[-1].T[None], h])
