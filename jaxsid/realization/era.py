@@ -9,7 +9,13 @@ from jaxtyping import Array, Float
 from jaxsid.mechanics.hold import laguerre_to_shift
 from jaxsid.realization.hankel import DenseOperator, hankel_operator
 from jaxsid.realization.order import select_order
-from jaxsid.realization.subspace import LinearOperator, Subspace, dominant_subspace, small_enough
+from jaxsid.realization.subspace import (
+    LinearOperator,
+    Subspace,
+    dominant_subspace,
+    leading_values,
+    small_enough,
+)
 from jaxsid.realization.window import check_method, check_order, check_response, check_steps, era_window
 from jaxsid.records import ImpulseResponse, Realization
 
@@ -63,7 +69,7 @@ def era(
     shape = (len(row_steps) * ir.h.shape[1], len(column_steps) * ir.h.shape[2])
     if order is None:
         candidates = min(LARGEST_CANDIDATE, *shape)
-        values = _singular_values(ir.h, row_steps, column_steps, candidates, method == "svd")
+        values = _singular_values(ir.h, row_steps, column_steps, candidates)
         order = select_order(values, shape=shape).order
     check_order(order, shape)
     A, B, C, D, factors = _era(ir.h, ir.pole, row_steps, column_steps, order, method == "svd")
@@ -122,7 +128,7 @@ def _era(h, pole, row_steps, column_steps, order, full):
     return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3, 4))
-def _singular_values(h, row_steps, column_steps, candidates, full):
-    operator = hankel_operator(h, row_steps, column_steps, 1, full)
-    return factor(operator, candidates, full).values
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _singular_values(h, row_steps, column_steps, candidates):
+    operator = hankel_operator(h, row_steps, column_steps, 1)
+    return leading_values(operator, candidates)

@@ -13,6 +13,7 @@ from jaxsid.mechanics.hold import laguerre_to_shift
 from jaxsid.realization.era import LARGEST_CANDIDATE, balanced, factor, named_factors
 from jaxsid.realization.hankel import Operator, hankel_matrix, hankel_operator
 from jaxsid.realization.order import select_order
+from jaxsid.realization.subspace import leading_values
 from jaxsid.realization.window import check_method, check_order, check_reach, check_response
 from jaxsid.records import ImpulseResponse, Realization
 
@@ -82,7 +83,7 @@ def era_dc(
     )
     size = lags * rows * ir.h.shape[1]
     if order is None:
-        values = _singular_values(ir.h, steps, min(LARGEST_CANDIDATE, size), method == "svd")
+        values = _singular_values(ir.h, steps, min(LARGEST_CANDIDATE, size))
         order = select_order(values, shape=(size, size)).order
     check_order(order, (size, size))
     check_order(order, (size, cols * ir.h.shape[2]))
@@ -196,6 +197,6 @@ def _era_dc(h, pole, steps, order, full):
     return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
-def _singular_values(h, steps, candidates, full):
-    return factor(_operator(h, h, steps, full), candidates, full).values
+@partial(jax.jit, static_argnums=(1, 2))
+def _singular_values(h, steps, candidates):
+    return leading_values(_operator(h, h, steps, False), candidates)

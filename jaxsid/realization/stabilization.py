@@ -62,7 +62,7 @@ def stabilization(
     shape_tolerance: float = 0.02,
     method: str = "fast",
 ) -> Stabilization:
-    """Stabilization diagram: one ERA factorization, a model for each order, each pole against the order before.
+    """Stabilization diagram: one ERA factorization, many orders, each pole against the order before.
 
     A pole is stable where, against the nearest one of the order before, abs(w - w0) <= tolerance w0,
     abs(zeta - zeta0) <= tolerance zeta0, and 1 - abs(phi* phi0)^2 / (phi* phi phi0* phi0) <= tolerance.
@@ -91,9 +91,8 @@ def stabilization(
     check_order(orders[-1], shape)
     check_order(orders[0], shape)
     a, c, values = _largest(ir.h, ir.pole, row_steps, column_steps, orders[-1], method == "svd")
-    models = [
-        _modes(np.asarray(a), np.asarray(c), float(ir.pole), float(ir.dt), n, ir.hold[0]) for n in orders
-    ]
+    numbers = np.asarray(a), np.asarray(c), float(ir.pole), float(ir.dt), ir.hold[0]
+    models = [_modes(*numbers, n) for n in orders]
     tolerances = (frequency_tolerance, damping_tolerance, shape_tolerance)
     return _diagram(orders, models, tolerances, np.asarray(values))
 

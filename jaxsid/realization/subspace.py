@@ -7,6 +7,7 @@ Source: Musco and Musco, "Randomized block Krylov methods", NeurIPS 2015; Baglam
 Comput. 27, 2005 (restarting).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -21,6 +22,7 @@ OVERSAMPLING = 10
 # Residual, in units of eps * the largest singular value, at which iteration stops: that of LAPACK.
 RESIDUAL = 30.0
 CG_STEPS = 300
+ROUGH_RESTARTS = 2
 
 
 class LinearOperator(Protocol):
@@ -69,7 +71,8 @@ def dominant_subspace(operator: LinearOperator, order: int, full: bool) -> Subsp
         assert isinstance(operator, DenseOperator)
         u, s, vt = jnp.linalg.svd(operator.matrix, full_matrices=False)
         return Subspace(u[:, :order], vt[:order].T, s)
-    return _iterate(operator, order)
+    width = block_width(operator.shape, order)
+    return _iterate(operator, order, width, RESTARTS)
 
 
 @dominant_subspace.defjvp
@@ -98,10 +101,38 @@ def _rotate(order: int, full: bool, primals: tuple, tangents: tuple) -> tuple[Su
     return space, Subspace(x, z, jnp.concatenate([ds, tail]))
 
 
-def _cg(product, right_side: Array) -> Array:
-    """Conjugate gradients on a positive definite operator near the identity."""
-    tol = 10 * float(jnp.finfo(right_side.dtype).eps)
-    return jax.scipy.sparse.linalg.cg(product, right_side, tol=tol, maxiter=CG_STEPS)[0]
+def leading_values(operator: LinearOperator, count: int) -> Float[Array, " count"]:
+    """The first `count` singular values, or nearly: good for a look at the order, not iterated to rounding.
+
+    Args:
+        operator: products with a (rows, cols) matrix.
+        count: how many.
+    """
+    width = min(count + OVERSAMPLING, *operator.shape)
+    return _iterate(operator, count, width, ROUGH_RESTARTS).values[:count]
+
+
+def _cg(product: Callable[[Array], Array], right_side: Array) -> Array:
+    """Solution of a symmetric positive definite system near the identity, differentiable both ways."""
+    return jax.lax.custom_linear_solve(product, right_side, _conjugate_gradients, symmetric=True)
+
+
+def _conjugate_gradients(product: Callable[[Array], Array], b: Array) -> Array:
+    stop = (10 * jnp.finfo(b.dtype).eps) ** 2 * jnp.vdot(b, b)
+
+    def unfinished(state: tuple) -> Array:
+        *_, size, count = state
+        return (size > stop) & (count < CG_STEPS)
+
+    def step(state: tuple) -> tuple:
+        x, residual, direction, size, count = state
+        image = product(direction)
+        length = size / jnp.vdot(direction, image)
+        residual = residual - length * image
+        new_size = jnp.vdot(residual, residual)
+        return x + length * direction, residual, residual + new_size / size * direction, new_size, count + 1
+
+    return jax.lax.while_loop(unfinished, step, (jnp.zeros_like(b), b, b, jnp.vdot(b, b), 0))[0]
 
 
 def _orthonormal(x: Array) -> Array:
@@ -146,9 +177,8 @@ def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
     return _State(left, values, right, operator.mv(right), state.count + 1)
 
 
-def _iterate(operator: LinearOperator, order: int) -> Subspace:
+def _iterate(operator: LinearOperator, order: int, width: int, restarts: int) -> Subspace:
     cols = operator.shape[1]
-    width = block_width(operator.shape, order)
     dtype = jax.eval_shape(operator.mv, jax.ShapeDtypeStruct((cols, 1), jnp.result_type(float))).dtype
     start = jax.random.normal(jax.random.key(0), (cols, width), dtype)
     basis = _orthonormal(operator.mv(start))
@@ -157,7 +187,7 @@ def _iterate(operator: LinearOperator, order: int) -> Subspace:
     tolerance = RESIDUAL * jnp.finfo(dtype).eps
 
     def unfinished(state: _State) -> Array:
-        return (state.count < RESTARTS) & (_residual(state, order) > tolerance)
+        return (state.count < restarts) & (_residual(state, order) > tolerance)
 
     state = jax.lax.while_loop(unfinished, lambda st: _expand(operator, st, width), state)
     return Subspace(state.left[:, :order], state.right[:, :order], state.values)
