@@ -1,0 +1,118 @@
+"""The modes of an identification one by one, each with its nominal counterpart, for tables and JSON."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsid.identification import Identification
+from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.records import SecondOrderModel
+
+INDICATORS = ("mac", "emac", "mpc", "cmi", "msv")
+
+
+class Mode(NamedTuple):
+    """A conjugate pair of poles, or one real pole.
+
+    Attributes:
+        index: of the pole with positive imaginary part among the poles of the model.
+        pole: 1/s.
+        frequency, frequency_std: Hz.
+        damping_ratio, damping_ratio_std: relative to critical.
+        indicators: mac, emac, mpc, cmi and msv; NaN where unknown.
+        nominal: the pole of the nominal model nearest to it, 1/s; None where there is none left.
+    """
+
+    index: int
+    pole: complex
+    frequency: float
+    frequency_std: float
+    damping_ratio: float
+    damping_ratio_std: float
+    indicators: dict[str, float]
+    nominal: complex | None
+
+    @property
+    def real(self) -> bool:
+        return self.pole.imag == 0
+
+    @property
+    def nominal_frequency(self) -> float:
+        return float("nan") if self.nominal is None else abs(self.nominal) / (2 * np.pi)
+
+    @property
+    def nominal_damping_ratio(self) -> float:
+        return float("nan") if not self.nominal else -self.nominal.real / abs(self.nominal)
+
+
+def upper(poles: np.ndarray) -> np.ndarray:
+    """Indices of one pole of each pair and of every real pole, slowest first."""
+    real = np.abs(poles.imag) <= 1e-9 * np.abs(poles)
+    return np.flatnonzero(real | (poles.imag > 0))
+
+
+def modes_of(found: Identification) -> tuple[Mode, ...]:
+    """One entry for each conjugate pair and each real pole, slowest first."""
+    poles = np.asarray(found.modal.poles)
+    keep = upper(poles)
+    indicators = found.modal.indicators
+    values = {name: np.asarray(getattr(indicators, name)) for name in INDICATORS} if indicators else {}
+    numbers = [
+        np.asarray(x)
+        for x in (found.modal.frequencies, found.frequency_std, found.modal.damping_ratios, found.damping_ratio_std)
+    ]
+    nominal = nominal_poles(found.nominal)
+    return tuple(
+        Mode(
+            int(i),
+            complex(poles[i].real, 0 if abs(poles[i].imag) <= 1e-9 * abs(poles[i]) else poles[i].imag),
+            float(numbers[0][i] / (2 * np.pi)),
+            float(numbers[1][i] / (2 * np.pi)),
+            float(numbers[2][i]),
+            float(numbers[3][i]),
+            {name: float(values[name][i]) if values else float("nan") for name in INDICATORS},
+            partner,
+        )
+        for i, partner in zip(keep, _partners(poles[keep], nominal), strict=True)
+    )
+
+
+def _partners(poles: np.ndarray, nominal: np.ndarray) -> list[complex | None]:
+    """The nominal pole of each pole, nearest pairs first, each used once."""
+    partners: list[complex | None] = [None] * len(poles)
+    size = np.abs(poles)[:, None] + np.abs(nominal)[None]
+    cost = np.abs(poles[:, None] - nominal[None]) / np.where(size > 0, size, 1)
+    for _ in range(min(len(poles), len(nominal))):
+        i, j = np.unravel_index(np.argmin(cost), cost.shape)
+        partners[i] = complex(nominal[j])
+        cost[i], cost[:, j] = np.inf, np.inf
+    return partners
+
+
+def nominal_poles(model: LumpedModel) -> np.ndarray:
+    """Poles of the linear part of a model with imaginary part >= 0, slowest first, 1/s."""
+    return poles_of(second_order(model))
+
+
+def poles_of(model: SecondOrderModel) -> np.ndarray:
+    """Eigenvalues of [[0, I], [-M^-1 K, -M^-1 D]] with imaginary part >= 0, slowest first, 1/s."""
+    mass, damping, stiffness = (np.asarray(x, float) for x in (model.mass, model.damping, model.stiffness))
+    size = len(mass)
+    lower = np.linalg.solve(mass, -np.hstack([stiffness, damping]))
+    poles = np.linalg.eigvals(np.vstack([np.eye(size, 2 * size, size), lower]))
+    poles = poles[poles.imag >= 0]
+    return poles[np.argsort(np.abs(poles))]
+
+
+def displacement_shapes(found: Identification, kinds: tuple[str, ...]) -> np.ndarray:
+    """Mode shapes as displacement whatever the sensors measure, each with largest component 1.
+
+    (outputs, n). A velocity is the displacement times the pole, an acceleration times its square.
+    """
+    poles, shapes = np.asarray(found.modal.poles), np.asarray(found.modal.shapes)
+    power = np.array([("displacement", "velocity", "acceleration").index(kind) for kind in kinds])
+    if len(set(kinds)) > 1:
+        safe = np.where(poles == 0, 1, poles)
+        shapes = shapes / safe[None] ** power[:, None]
+    top = np.take_along_axis(shapes, np.argmax(np.abs(shapes), axis=0)[None], axis=0)
+    return shapes / np.where(top == 0, 1, top)

@@ -1,0 +1,65 @@
+"""Numbers as people read them: as many digits as the standard deviation allows, change in percent."""
+
+import math
+
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MISSING = "–"
+
+
+def power_of_ten(exponent: int) -> str:
+    return "10" + str(exponent).translate(SUPERSCRIPTS)
+
+
+def minus(text: str) -> str:
+    """The same with the proper minus sign."""
+    return text.replace("-", "−")
+
+
+def exponent_of(value: float) -> int:
+    return math.floor(math.log10(abs(value))) if value else 0
+
+
+def significant(value: float, digits: int = 4) -> str:
+    """The value rounded to so many significant digits; a power of ten where it is huge or tiny."""
+    if not math.isfinite(value):
+        return MISSING
+    if value == 0:
+        return "0"
+    exponent = exponent_of(float(f"{value:.{digits - 1}e}"))
+    if -4 <= exponent < 6:
+        return minus(f"{value:.{max(digits - 1 - exponent, 0)}f}")
+    return minus(f"{value / 10.0**exponent:.{digits - 1}f}") + " × " + power_of_ten(exponent)
+
+
+def with_std(value: float, std: float | None, digits: int = 5) -> str:
+    """value ± std, the deviation with two digits and the value with as many decimals, at most eight digits."""
+    if not math.isfinite(value):
+        return MISSING
+    if std is None or not math.isfinite(std) or std <= 0:
+        return significant(value, digits)
+    exponent = exponent_of(max(abs(value), std))
+    if exponent - exponent_of(std) > 6:
+        return f"{significant(value, 8)} ± {significant(std, 1)}"
+    decimals = 1 - exponent_of(float(f"{std:.1e}"))
+    if -4 <= exponent < 6:
+        places = max(decimals, 0)
+        return minus(f"{value:.{places}f} ± {std:.{places}f}")
+    scale, places = 10.0**exponent, max(decimals + exponent, 0)
+    return minus(f"({value / scale:.{places}f} ± {std / scale:.{places}f}) × ") + power_of_ten(exponent)
+
+
+def change(value: float, reference: float) -> str:
+    """By how much the value differs from the reference, in percent of it."""
+    if not (math.isfinite(value) and math.isfinite(reference)) or reference == 0:
+        return MISSING
+    percent = 100 * (value / reference - 1)
+    return minus(f"{percent:+.{1 if abs(percent) >= 0.95 else 2}f} %")
+
+
+def percent(share: float) -> str:
+    """A share in percent, three significant digits."""
+    return f"{significant(100 * share, 3)} %" if math.isfinite(share) else MISSING
+
+
+def plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,88 @@
+"""What `identification.json` holds."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxsid.files.results_json import SCHEMA, plain
+from jaxsid.identification import Identification
+from jaxsid.records import SecondOrderModel
+from jaxsid.report.modes import Mode, modes_of
+
+MATRICES = ("mass", "damping", "stiffness")
+
+
+def identification_json(found: Identification) -> dict[str, Any]:
+    """The identification in the types of JSON, by the schema of `identification.json`.
+
+    Frequencies in Hz, poles in 1/s as [real, imaginary], matrices in the order of `bodies`, null where they
+    could not be found. What is not a number is null.
+    """
+    data = {
+        "schema": SCHEMA,
+        "name": found.nominal.name,
+        "order": found.order,
+        "order_reason": found.order_reason,
+        "modes": [_mode(mode) for mode in modes_of(found)],
+        "poles": np.asarray(found.modal.poles),
+        **_matrices(found.matrices),
+        "std": None if found.matrices_std is None else _matrices(found.matrices_std),
+        "fit": {
+            "train_nrmse": _by_name(found.outputs, found.train_nrmse),
+            "noise_floor": _by_name(found.outputs, found.noise_floor),
+        },
+        "warnings": list(found.warnings),
+        "bodies": list(found.nominal.bodies),
+        "sensors": list(found.outputs),
+        "inputs": list(found.records[0].inputs) if found.records else [],
+        "cbsi": None if found.cbsi is None else _cbsi(found.cbsi),
+        "impulse_response": _impulse_response(found),
+        "state_space": {name: np.asarray(getattr(found.continuous, name)) for name in "ABCD"},
+        "records": [_record(record) for record in found.records],
+    }
+    return plain(data, "identification")
+
+
+def _mode(mode: Mode) -> dict[str, Any]:
+    return {
+        "frequency_hz": mode.frequency,
+        "damping_ratio": mode.damping_ratio,
+        "pole": mode.pole,
+        **mode.indicators,
+        "std": {"frequency_hz": mode.frequency_std, "damping_ratio": mode.damping_ratio_std},
+    }
+
+
+def _matrices(holder: Any) -> dict[str, Any]:
+    return {name: None if holder is None else np.asarray(getattr(holder, name)) for name in MATRICES}
+
+
+def _by_name(names: tuple[str, ...], values: Any) -> dict[str, float]:
+    return dict(zip(names, np.asarray(values).tolist(), strict=True))
+
+
+def _cbsi(model: SecondOrderModel) -> dict[str, Any]:
+    diagnostics = model.diagnostics
+    values = {} if diagnostics is None else {k: float(v) for k, v in vars(diagnostics).items()}
+    return {**_matrices(model), "diagnostics": values}
+
+
+def _impulse_response(found: Identification) -> dict[str, Any]:
+    response = found.response
+    return {
+        "method": response.method,
+        "band_hz": response.band,
+        "interval_s": float(response.dt),
+        "laguerre_pole": float(response.pole),
+        "noise_std": response.noise_std,
+    }
+
+
+def _record(record: Any) -> dict[str, Any]:
+    return {
+        "name": record.name,
+        "samples": len(record.y),
+        "interval_s": float(record.dt),
+        "inputs": list(record.inputs),
+        "outputs": list(record.outputs),
+    }

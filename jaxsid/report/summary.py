@@ -1,0 +1,76 @@
+"""A summary of an identification for the terminal."""
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.panel import Panel
+from rich.table import Table
+
+from jaxsid.identification import Identification
+from jaxsid.mechanics.lumped import second_order
+from jaxsid.report.modes import modes_of
+from jaxsid.report.numbers import change, percent, significant, with_std
+from jaxsid.report.results import MATRICES
+from jaxsid.report.units import units_of
+
+SHOWN = 6  # larger matrices are left to the files
+
+
+def print_summary(found: Identification, console: Console | None = None) -> None:
+    """Modes, matrices, fit and warnings as rich tables, on standard output unless a console is given."""
+    console = console or Console()
+    console.print(f"\n[bold]{escape(found.nominal.name)}[/]: order {found.order}. {escape(found.order_reason)}")
+    console.print(_modes(found))
+    for table in _matrices(found):
+        console.print(table)
+    console.print(_fit(found))
+    if found.warnings:
+        text = "\n".join(f"• {escape(warning)}" for warning in found.warnings)
+        console.print(Panel(text, title="Warnings", border_style="yellow", title_align="left"))
+
+
+def _table(title: str, *header: str) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", header_style="dim")
+    for column, name in enumerate(header):
+        table.add_column(name, justify="right" if column else "left", overflow="fold")
+    return table
+
+
+def _modes(found: Identification) -> Table:
+    table = _table("Modes", "", "Hz", "change", "damping ratio (%)", "MAC", "EMAC", "MPC", "MSV")
+    for number, mode in enumerate(modes_of(found), 1):
+        table.add_row(
+            f"{number}{' real' if mode.real else ''}",
+            with_std(mode.frequency, mode.frequency_std),
+            change(mode.frequency, mode.nominal_frequency),
+            with_std(100 * mode.damping_ratio, 100 * mode.damping_ratio_std),
+            *(significant(mode.indicators[name], 3) for name in ("mac", "emac", "mpc", "msv")),
+        )
+    return table
+
+
+def _matrices(found: Identification) -> list[Table]:
+    if found.matrices is None or len(found.matrices.mass) > SHOWN:
+        return []
+    nominal, units, tables = second_order(found.nominal), units_of(found.nominal), []
+    for which in MATRICES:
+        values, old = (np.asarray(getattr(x, which)) for x in (found.matrices, nominal))
+        std = None if found.matrices_std is None else np.asarray(getattr(found.matrices_std, which))
+        table = _table(f"{units.name(which).capitalize()} ({units.symbol(which)})", "", *found.nominal.bodies)
+        for i, body in enumerate(found.nominal.bodies):
+            table.add_row(body, *(_entry(values[i, j], None if std is None else std[i, j], old[i, j])
+                                  for j in range(len(values))))  # fmt: skip
+        tables.append(table)
+    return tables
+
+
+def _entry(value: float, std: float | None, nominal: float) -> str:
+    text = with_std(float(value), std)
+    return f"{text}\n[dim]{change(value, nominal)}[/]" if nominal else text
+
+
+def _fit(found: Identification) -> Table:
+    table = _table("Fit", "sensor", "NRMSE", "noise floor")
+    for name, nrmse, floor in zip(found.outputs, found.train_nrmse, found.noise_floor, strict=True):
+        table.add_row(escape(name), percent(float(nrmse)), percent(float(floor)))
+    return table
