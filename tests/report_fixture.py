@@ -54,7 +54,7 @@ def identification(samples: int = 4000) -> Identification:
     response = ImpulseResponse(
         noisy, DT, noise_std=0.02 * clean.std(axis=0), band=(1.0, 80.0), method="Fourier, three averages"
     )
-    realization = era(response, order=6, rows=60, cols=200)
+    realization = era(response, order=6, rows=60, cols=60)
     found_modal = modal(realization)
     n = len(found_modal.poles)
     matrices = SecondOrderModel(
@@ -75,8 +75,8 @@ def identification(samples: int = 4000) -> Identification:
         realization=realization,
         continuous=continuous,
         order=6,
-        order_reason="The singular values drop by a factor of 40 after the sixth, and all six poles are stable.",
-        stabilization=stabilization(response, range(2, 31, 2), rows=60, cols=200),
+        order_reason="The singular values drop by a factor of 40 after the sixth; all six poles are stable.",
+        stabilization=stabilization(response, range(2, 31, 2), rows=60, cols=60),
         modal=found_modal,
         frequency_std=found_modal.frequencies * 2e-4,
         damping_ratio_std=jnp.full(n, 4e-4),
@@ -100,7 +100,10 @@ def frequency_fit(record: Record, matrices: SecondOrderModel) -> FrequencyFit:
     measured = cross / scipy.signal.welch(u, rate, nperseg=1000)[1]
     curves = [acceleration_response(matrices, f, factor)[..., None] for factor in (1.0, 0.99)]
     return FrequencyFit(
-        jnp.asarray(f), jnp.asarray(measured.T[..., None]), jnp.asarray(coherence.T), *map(jnp.asarray, curves)
+        jnp.asarray(f),
+        jnp.asarray(measured.T[..., None]),
+        jnp.asarray(coherence.T),
+        *map(jnp.asarray, curves),
     )
 
 

@@ -1,1 +1,1 @@
-"""Results for people: figures, one HTML page, a summary for the terminal, and the JSON of an identification."""
+"""Results for people: figures, an HTML page, a summary for the terminal, and identification.json."""

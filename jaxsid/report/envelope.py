@@ -1,4 +1,4 @@
-"""Long curves with few points: the smallest and largest value of each stretch, which is what a screen shows."""
+"""Long curves with few points: the smallest and largest value of each stretch, as a screen shows them."""
 
 import numpy as np
 

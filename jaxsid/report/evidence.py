@@ -9,7 +9,7 @@ from jaxsid.records import CbsiDiagnostics, Record
 from jaxsid.report.findings import TABLED
 from jaxsid.report.frame import Cell, Gallery, Link, Links, Picture, Section, Table, Text, picture
 from jaxsid.report.modes import modes_of
-from jaxsid.report.numbers import minus, percent, plural, significant
+from jaxsid.report.numbers import percent, significant
 from jaxsid.report.plots import (
     frequency_figure,
     impulse_figure,
@@ -24,6 +24,28 @@ from jaxsid.report.plots.impulse import ROWS, plain_time
 from jaxsid.report.results import MATRICES
 
 TIME_FIGURES, FREQUENCY_FIGURES, SHAPES, IMPULSES = 6, 6, 8, 3
+REFERENCES = (
+    Link(
+        "J.-N. Juang and R. S. Pappa, An eigensystem realization algorithm for modal parameter "
+        "identification and model reduction, J. Guidance 8 (1985)",
+        "https://doi.org/10.2514/3.20031",
+    ),
+    Link(
+        "J.-N. Juang, J. E. Cooper and J. R. Wright, An eigensystem realization algorithm using data "
+        "correlations (ERA/DC), Control Theory and Advanced Technology 4 (1988)"
+    ),
+    Link(
+        "R. S. Pappa, K. B. Elliott and A. Schenk, Consistent-mode indicator for the eigensystem realization "
+        "algorithm, J. Guidance 16 (1993)",
+        "https://doi.org/10.2514/3.21092",
+    ),
+    Link(
+        "K. F. Alvin and K. C. Park, Second-order structural identification procedure via state-space-based "
+        "system identification, AIAA Journal 32 (1994)",
+        "https://doi.org/10.2514/3.11997",
+    ),
+    Link("W. Heylen, S. Lammens and P. Sas, Modal Analysis Theory and Testing, KU Leuven (1997)"),
+)
 
 
 def time_section(found: Identification) -> Section:
@@ -36,12 +58,22 @@ def time_section(found: Identification) -> Section:
     ]
     misfit = dict(zip(found.outputs, np.nan_to_num(np.asarray(found.train_nrmse)).tolist(), strict=True))
     kept = sorted(sorted(places, key=lambda p: -misfit[p[1]])[:TIME_FIGURES])
-    caption = (
-        "Top: the whole record. Middle: the shaded stretch, where the two curves should coincide. Bottom: measured less "
-        "modelled; where the model is right it is noise, mostly within ± two standard deviations (dashed)."
+    note = (
+        "Top: the whole record. Middle: the marked stretch, where the two curves should coincide. "
+        "Bottom: measured less modelled; where the model is right it is noise, mostly within ± two "
+        "standard deviations (dashed)."
     )
-    pictures = tuple(picture(time_figure(found, output, record), caption) for record, output in kept)
-    return Section("Response in time", (*_left_out(len(places), len(kept), "the worst fitting"), Gallery(pictures)))
+    pictures = tuple(
+        picture(time_figure(found, output, record), _fit_caption(found, output)) for record, output in kept
+    )
+    left_out = _left_out(len(places), len(kept), "the worst fitting")
+    return Section("Response in time", (*left_out, Gallery(pictures, note)))
+
+
+def _fit_caption(found: Identification, output: str) -> str:
+    row = found.outputs.index(output)
+    misfit, floor = percent(float(found.train_nrmse[row])), percent(float(found.noise_floor[row]))
+    return f"{output}: misfit {misfit} over all records; noise alone would leave {floor}."
 
 
 def _left_out(there: int, shown: int, which: str) -> tuple[Text, ...]:
@@ -59,13 +91,24 @@ def frequency_section(found: Identification) -> Section:
         for column in range(fit.measured.shape[2])
         if np.isfinite(np.asarray(fit.measured)[:, row, column]).any()
     ]
-    caption = (
-        "The model should follow the measured curve at and around the modes (dotted lines). A coherence near 1 means that "
-        "the inputs explain the output; where it drops, noise or nonlinearity rules. Grey: outside the trusted band."
+    note = (
+        "The model should follow the measured curve at and around the modes (dotted lines). A coherence "
+        "near 1 means that the inputs explain the output; where it drops, noise or nonlinearity rules. "
+        "Grey: outside the trusted band."
     )
     kept = places[:FREQUENCY_FIGURES]
-    pictures = tuple(picture(frequency_figure(found, output, column, record), caption) for record, output, column in kept)
-    return Section("Frequency response", (*_left_out(len(places), len(kept), "the first"), Gallery(pictures)))
+    pictures = tuple(
+        picture(frequency_figure(found, output, column, record), _source(found, output, column, record))
+        for record, output, column in kept
+    )
+    return Section(
+        "Frequency response", (*_left_out(len(places), len(kept), "the first"), Gallery(pictures, note))
+    )
+
+
+def _source(found: Identification, output: str, column: int, record: int) -> str:
+    given = found.records[record]
+    return f"{output} over {given.inputs[column]}, from {given.name}."
 
 
 def shapes_section(found: Identification) -> Section:
@@ -75,11 +118,11 @@ def shapes_section(found: Identification) -> Section:
         "Left: displacement of the sensors, largest component 1; a change of sign is a node between them. "
         "Right: the components in the complex plane; on one line, the sensors move in phase or against it."
     )
-    pictures = [
-        picture(mode_shape_figure(found, first, 4), caption) for first in range(0, count, 4)
-    ]
-    poles = picture(pole_figure(found), "Every pole left of the vertical line decays. Bars: two standard deviations; squares: "
-                    "the nominal model.")  # fmt: skip
+    pictures = [picture(mode_shape_figure(found, first, 4), caption) for first in range(0, count, 4)]
+    meaning = (
+        "Left of the vertical line a mode decays. Bars: two standard deviations; squares: the nominal model."
+    )
+    poles = picture(pole_figure(found), meaning)
     left_out = _left_out(len(modes_of(found)), count, "the slowest")
     return Section("Mode shapes and poles", (*left_out, Gallery((*pictures, poles))))
 
@@ -87,7 +130,8 @@ def shapes_section(found: Identification) -> Section:
 def order_section(found: Identification) -> Section:
     values = picture(
         singular_value_figure(found),
-        "A drop after the filled points means that the data support this order and no more; a slope means noise.",
+        "A drop after the filled points means that the data support this order and no more; a slope "
+        "means noise.",
     )
     diagram = picture(
         stabilization_figure(found),
@@ -106,10 +150,12 @@ def impulse_section(found: Identification) -> Section:
         words += f" Trusted from {low} to {high} Hz; outside, the records do not excite the system enough."
     if not plain_time(found):
         words += (
-            f" It was estimated in a Laguerre basis (pole {significant(float(response.pole), 4)}), which has no "
-            "samples in time to compare, so that only the model's response is drawn."
+            f" It was estimated in a Laguerre basis (pole {significant(float(response.pole), 4)}), which "
+            "has no samples in time to compare, so that only the model's response is drawn."
         )
-    caption = "The model should follow the estimate until it drowns in noise. It is the answer to one sample of unit force."
+    caption = (
+        "Answer to one sample of unit force: the model should follow the estimate until that drowns in noise."
+    )
     count = min(found.time_response.shape[2], IMPULSES)
     pictures = tuple(picture(impulse_figure(found, column), caption) for column in range(count))
     left_out = _left_out(len(found.outputs), min(len(found.outputs), ROWS), "the first sensors")
@@ -130,22 +176,33 @@ def cbsi_section(found: Identification) -> Section:
     if diagnostics is None:
         return Section("Consistency with a mechanical system", ())
     intro = (
-        "CBSI turns the state-space model into mass, damping and stiffness directly; its result is the starting point of "
-        "the fit. A state-space model of a real mechanical system passes these tests with 0; noise, missing modes and "
-        "wrong sensor positions do not."
+        "CBSI turns the state-space model into mass, damping and stiffness directly; its result is the "
+        "starting point of the fit. A state-space model of a real mechanical system passes these tests "
+        "with 0; noise, missing modes and wrong sensor positions do not."
     )
     header = ("Test", "Value", "Meaning")
-    return Section("Consistency with a mechanical system", (Text(intro), Table(header, _cbsi_rows(diagnostics))))
+    return Section(
+        "Consistency with a mechanical system", (Text(intro), Table(header, _cbsi_rows(diagnostics)))
+    )
 
 
 def _cbsi_rows(diagnostics: CbsiDiagnostics) -> tuple[tuple[str | Cell, ...], ...]:
     meanings = {
-        "upper_block_error": ("Velocity is the rate of displacement", "distance from that identity, relative"),
-        "feedthrough_error": ("Force moves nothing at once", "jump of displacement or velocity per force, relative"),
+        "upper_block_error": (
+            "Velocity is the rate of displacement",
+            "distance from that identity, relative",
+        ),
+        "feedthrough_error": (
+            "Force moves nothing at once",
+            "jump of displacement or velocity per force, relative",
+        ),
         "mass_asymmetry": ("Symmetric mass", "difference between the two triangles, relative"),
         "damping_asymmetry": ("Symmetric damping", "likewise; damping is the weakest of the three"),
         "stiffness_asymmetry": ("Symmetric stiffness", "likewise"),
-        "negative_scales": ("Modes against their driving point", "number of modes whose force and sensor disagree in sign"),
+        "negative_scales": (
+            "Modes against their driving point",
+            "number of modes whose force and sensor disagree in sign",
+        ),
     }
     return tuple(
         (title, significant(float(getattr(diagnostics, name)), 2), Cell(meaning, tone="wide"))
@@ -174,25 +231,15 @@ def _record_row(record: Record) -> tuple[str | Cell, ...]:
 def method_section(found: Identification) -> Section:
     """How it was computed, in words, and where to read more."""
     words = (
-        "The impulse response is estimated from inputs and outputs. The eigensystem realization algorithm "
-        "(ERA, or ERA/DC on its correlations) factors the block Hankel matrix of its samples and gives a state-space model; "
-        "the eigenvalues are the poles, the eigenvectors seen by the sensors the mode shapes. Where sensors and inputs allow "
-        "it, common-basis structural identification (CBSI) turns the model into mass, damping and stiffness, which a "
-        "least-squares fit to the records then refines with symmetric matrices. Standard deviations follow from the noise "
-        "of the records, to first order. The nominal model is compared with, and is no prior."
+        "The impulse response is estimated from inputs and outputs. The eigensystem realization "
+        "algorithm (ERA, or ERA/DC on its correlations) factors the block Hankel matrix of its samples "
+        "and gives a state-space model; the eigenvalues are the poles, the eigenvectors seen by the "
+        "sensors the mode shapes. Where sensors and inputs allow it, common-basis structural "
+        "identification (CBSI) turns the model into mass, damping and stiffness, which a least-squares "
+        "fit to the records then refines with symmetric matrices. Standard deviations follow from the "
+        "noise of the records, to first order. The nominal model is compared with, and is no prior."
     )
-    references = (
-        Link("J.-N. Juang and R. S. Pappa, An eigensystem realization algorithm for modal parameter identification and "
-             "model reduction, J. Guidance 8 (1985)", "https://doi.org/10.2514/3.20031"),
-        Link("J.-N. Juang, J. E. Cooper and J. R. Wright, An eigensystem realization algorithm using data correlations "
-             "(ERA/DC), Control Theory and Advanced Technology 4 (1988)"),
-        Link("R. S. Pappa, K. B. Elliott and A. Schenk, Consistent-mode indicator for the eigensystem realization "
-             "algorithm, J. Guidance 16 (1993)", "https://doi.org/10.2514/3.21092"),
-        Link("K. F. Alvin and K. C. Park, Second-order structural identification procedure via state-space-based system "
-             "identification, AIAA Journal 32 (1994)", "https://doi.org/10.2514/3.11997"),
-        Link("W. Heylen, S. Lammens and P. Sas, Modal Analysis Theory and Testing, KU Leuven (1997)"),
-    )  # fmt: skip
-    return Section("How it was computed", (Text(words), Links(references)))
+    return Section("How it was computed", (Text(words), Links(REFERENCES)))
 
 
 def software() -> str:

@@ -4,14 +4,19 @@ import numpy as np
 
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import LumpedModel, second_order
-from jaxsid.report.frame import Card, Cards, Cell, Notice, Section, Table, Tables, Text
+from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
 from jaxsid.report.modes import Mode, modes_of
-from jaxsid.report.numbers import change, percent, plural, significant, with_std
+from jaxsid.report.numbers import MISSING, TIMES, change, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
 
+NO_MATRICES = (
+    "These records do not determine the matrices. One driving point (a force and a sensor on the same "
+    "body) and as many modes as bodies are needed; the warnings say what is missing. The modes above "
+    "hold all the same."
+)
 TABLED = 8  # larger matrices are shown as figures
-GOOD_FIT, POOR_FIT = 1.5, 3.0  # misfit over noise floor
+GOOD_FIT, POOR_FIT = 1.2, 3.0  # misfit over noise floor
 TRUSTED = 0.8  # indicators below this make a mode doubtful
 
 
@@ -28,13 +33,19 @@ def _cards(found: Identification) -> tuple[Card, ...]:
     if worst is not None:
         floor = float(found.noise_floor[worst])
         fit = f"{found.outputs[worst]}; noise alone leaves {percent(floor)}"
-    largest = "–" if worst is None else percent(float(found.train_nrmse[worst]))
+    largest = MISSING if worst is None else percent(float(found.train_nrmse[worst]))
     seen = [mode.frequency for mode in modes if not mode.real]
     span = f"{significant(min(seen), 3)} to {significant(max(seen), 3)} Hz" if seen else "no vibration mode"
-    matrices = ("not found", "see the warnings") if found.matrices is None else (
-        f"{len(found.matrices.mass)} × {len(found.matrices.mass)}", "mass, damping and stiffness")  # fmt: skip
+    matrices = ("not found", "see the warnings")
+    if found.matrices is not None:
+        size = str(len(found.matrices.mass))
+        matrices = (size + TIMES + size, "mass, damping and stiffness")
     return (
-        Card("Modes", str(pairs), span + (f", {plural(len(modes) - pairs, 'real pole')}" if pairs < len(modes) else "")),
+        Card(
+            "Modes",
+            str(pairs),
+            span + (f", {plural(len(modes) - pairs, 'real pole')}" if pairs < len(modes) else ""),
+        ),
         Card("Largest misfit (NRMSE)", largest, fit),
         Card("Order", str(found.order), "states of the model"),
         Card("Matrices", *matrices),
@@ -56,35 +67,46 @@ def _warnings(found: Identification) -> Notice:
 def modes_table(found: Identification) -> Table:
     """Frequencies, damping ratios and indicators of all modes, beside those of the nominal model."""
     rated = found.modal.indicators is not None
-    header = ("Mode", "Frequency (Hz)", "Change", "Damping ratio (%)", "Change")
+    header = ("Mode", "Frequency (Hz)", "Nominal", "Damping ratio (%)", "Nominal")
     rows = tuple(_mode_row(i, mode, rated) for i, mode in enumerate(modes_of(found), 1))
-    note = "± one standard deviation. Change: against the nearest mode of the nominal model, whose value stands below. "
+    note = (
+        "± one standard deviation. Nominal: the nearest mode of the nominal model, and the change from it. "
+    )
     if rated:
         note += (
-            "MAC, EMAC and MPC near 1: a mode the data support (steady decay, the same over the whole response, "
-            f"one phase for all sensors); below {TRUSTED} look at it twice. MSV: its share in the response."
+            "MAC, EMAC and MPC near 1: a mode the data support (steady decay, the same over the whole "
+            f"response, one phase for all sensors); below {TRUSTED} look at it twice. MSV: its share in "
+            "the response."
         )
     return Table(header + (("MAC", "EMAC", "MPC", "MSV") if rated else ()), rows, "Modes", note)
 
 
 def _mode_row(number: int, mode: Mode, rated: bool) -> tuple[str | Cell, ...]:
-    nominal = significant(mode.nominal_frequency)
-    damping = 100 * mode.damping_ratio
+    damping, nominal = 100 * mode.damping_ratio, 100 * mode.nominal_damping_ratio
     kind = "real pole" if mode.real else ""
     row = (
         Cell(str(number), kind),
         with_std(mode.frequency, mode.frequency_std),
-        Cell(change(mode.frequency, mode.nominal_frequency), nominal),
-        Cell(with_std(damping, 100 * mode.damping_ratio_std), "unstable" if damping < 0 else "", tone="warning" if damping < 0 else ""),
-        Cell(change(damping, 100 * mode.nominal_damping_ratio), significant(100 * mode.nominal_damping_ratio)),
+        Cell(significant(mode.nominal_frequency), _known_change(mode.frequency, mode.nominal_frequency)),
+        Cell(
+            with_std(damping, 100 * mode.damping_ratio_std),
+            "unstable" if damping < 0 else "",
+            tone="warning" if damping < 0 else "",
+        ),
+        Cell(significant(nominal), _known_change(damping, nominal)),
     )
     return row + (_ratings(mode) if rated else ())
+
+
+def _known_change(value: float, nominal: float) -> str:
+    """The change against the nominal value, nothing where there is none."""
+    return change(value, nominal) if nominal and np.isfinite(nominal) else ""
 
 
 def _ratings(mode: Mode) -> tuple[Cell, ...]:
     values = [mode.indicators[name] for name in ("mac", "emac", "mpc")]
     rated = tuple(
-        Cell("–" if np.isnan(x) else f"{x:.3f}", tone="warning" if x < TRUSTED else "") for x in values
+        Cell(MISSING if np.isnan(x) else f"{x:.3f}", tone="warning" if x < TRUSTED else "") for x in values
     )
     return *rated, Cell(significant(mode.indicators["msv"], 3))
 
@@ -92,11 +114,8 @@ def _ratings(mode: Mode) -> tuple[Cell, ...]:
 def matrices_section(found: Identification) -> Section:
     """Mass, damping and stiffness with deviations, or why there are none."""
     if found.matrices is None:
-        return Section("Mass, damping, stiffness", (Text(
-            "These records do not determine the matrices. One driving point (a force and a sensor on the same body) "
-            "and as many modes as bodies are needed; the warnings say what is missing. The modes above hold all the same."
-        ),))  # fmt: skip
-    blocks = [Text("Symmetric matrices that fit the records best, in the order of the bodies.")]
+        return Section("Mass, damping, stiffness", (Text(NO_MATRICES),))
+    blocks: list[Block] = [Text("Symmetric matrices that fit the records best, in the order of the bodies.")]
     if len(found.matrices.mass) <= TABLED:
         blocks.append(Tables(tuple(_matrix(found, which) for which in MATRICES)))
     elements = _elements(found)
@@ -134,23 +153,29 @@ def _beside(value: float, nominal: float) -> str:
 def _elements(found: Identification) -> Table | None:
     """Bodies and connections one by one, where both models are made of them."""
     new, old = found.identified, found.nominal
-    if new is None or new.matrices is not None or old.matrices is not None or new.connections != old.connections:
+    if (
+        new is None
+        or new.matrices is not None
+        or old.matrices is not None
+        or new.connections != old.connections
+    ):
         return None
     units = units_of(old)
     rows = [(body, *_pair(new.mass[i], old.mass[i]), "", "") for i, body in enumerate(old.bodies)]
     rows += [_connection(new, old, i) for i in range(len(old.connections))]
-    header = ("Element", f"{units.name('mass').capitalize()} or stiffness", "Change", "Damping", "Change")
+    header = ("Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal")
     title = f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
-    return Table(header, tuple(rows), title, "Below each change: the nominal value.")
+    return Table(header, tuple(rows), title, "Below each nominal value: the change from it.")
 
 
 def _connection(new: LumpedModel, old: LumpedModel, i: int) -> tuple[str | Cell, ...]:
-    name = Cell(old.connections[i].name, " – ".join(old.connections[i].between))
+    name = Cell(old.connections[i].name, f" {MISSING} ".join(old.connections[i].between))
     return name, *_pair(new.stiffness[i], old.stiffness[i]), *_pair(new.damping[i], old.damping[i])
 
 
 def _pair(value, nominal) -> tuple[str, Cell]:
-    return significant(float(value), 5), Cell(change(float(value), float(nominal)), significant(float(nominal)))
+    value, nominal = float(value), float(nominal)
+    return significant(value, 5), Cell(significant(nominal), _known_change(value, nominal))
 
 
 def fit_section(found: Identification) -> Section:
@@ -161,9 +186,9 @@ def fit_section(found: Identification) -> Section:
     )
     header = ("Sensor", "Misfit (NRMSE)", "Noise floor", "Ratio", "Reading")
     note = (
-        "NRMSE: rms of measured less modelled, over the standard deviation of the measured signal. Noise floor: what "
-        "a perfect model would leave. A ratio near 1 means that nothing but noise is left; well above, the "
-        "system does something that a linear model of this kind does not."
+        "NRMSE: rms of measured less modelled, over the standard deviation of the measured signal. "
+        "Noise floor: what a perfect model would leave. A ratio near 1 means that nothing but noise is "
+        "left; well above, the system does something that a linear model of this kind does not."
     )
     return Section("Fit", (Table(header, rows, "", note),))
 
@@ -172,9 +197,9 @@ def _fit_row(name: str, nrmse: float, floor: float) -> tuple[str | Cell, ...]:
     ratio = nrmse / floor if floor > 0 else float("nan")
     reading, tone = "noise floor unknown", ""
     if ratio <= GOOD_FIT:
-        reading, tone = "only noise is left", "good"
+        reading, tone = "noise only", "good"
     elif ratio > POOR_FIT:
-        reading, tone = "far more than noise is left", "warning"
+        reading, tone = "far above noise", "warning"
     elif ratio > GOOD_FIT:
-        reading = "a little more than noise is left"
+        reading = "above noise"
     return name, percent(nrmse), percent(floor), significant(ratio, 3), Cell(reading, tone=tone)

@@ -78,7 +78,10 @@ class Picture(NamedTuple):
 
 
 class Gallery(NamedTuple):
+    """Figures beside one another, over them what to look for in all."""
+
     pictures: tuple[Picture, ...]
+    note: str = ""
     kind: str = "gallery"
 
 
@@ -118,7 +121,9 @@ def cell(entry: str | Cell) -> Cell:
 def page(title: str, subtitle: str, sections: Sequence[Section], footer: str = "") -> str:
     """One self-contained HTML page."""
     text = files("jaxsid.report").joinpath("template.html.j2").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
     environment.filters["cell"] = cell
     return environment.from_string(text).render(
         title=title, subtitle=subtitle, sections=[s for s in sections if s.blocks], footer=footer

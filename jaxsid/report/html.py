@@ -39,7 +39,9 @@ def write_report(found: Identification, path: Path | str) -> None:
 def report_page(found: Identification) -> str:
     """The report as text."""
     title = f"Identification of {found.nominal.name}"
-    return page(title, _subtitle(found), report_sections(found), f"Made with {software()}. All values in SI units.")
+    return page(
+        title, _subtitle(found), report_sections(found), f"Made with {software()}. All values in SI units."
+    )
 
 
 def report_sections(found: Identification) -> tuple[Section, ...]:
@@ -64,7 +66,9 @@ def report_sections(found: Identification) -> tuple[Section, ...]:
 
 def _subtitle(found: Identification) -> str:
     seconds = sum(len(record.y) * float(record.dt) for record in found.records)
-    kind = {True: "rotation", False: "translation", None: "translation or rotation"}[units_of(found.nominal).turning]
+    kind = {True: "rotation", False: "translation", None: "translation or rotation"}[
+        units_of(found.nominal).turning
+    ]
     return (
         f"{plural(len(found.records), 'record')}, {significant(seconds, 3)} s in all, "
         f"{plural(len(found.outputs), 'sensor')}; units of {kind}"

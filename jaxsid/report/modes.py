@@ -47,8 +47,8 @@ class Mode(NamedTuple):
 
 def upper(poles: np.ndarray) -> np.ndarray:
     """Indices of one pole of each pair and of every real pole, slowest first."""
-    real = np.abs(poles.imag) <= 1e-9 * np.abs(poles)
-    return np.flatnonzero(real | (poles.imag > 0))
+    real = np.abs(np.imag(poles)) <= 1e-9 * np.abs(poles)
+    return np.flatnonzero(real | (np.imag(poles) > 0))
 
 
 def modes_of(found: Identification) -> tuple[Mode, ...]:
@@ -59,13 +59,18 @@ def modes_of(found: Identification) -> tuple[Mode, ...]:
     values = {name: np.asarray(getattr(indicators, name)) for name in INDICATORS} if indicators else {}
     numbers = [
         np.asarray(x)
-        for x in (found.modal.frequencies, found.frequency_std, found.modal.damping_ratios, found.damping_ratio_std)
+        for x in (
+            found.modal.frequencies,
+            found.frequency_std,
+            found.modal.damping_ratios,
+            found.damping_ratio_std,
+        )
     ]
     nominal = nominal_poles(found.nominal)
     return tuple(
         Mode(
             int(i),
-            complex(poles[i].real, 0 if abs(poles[i].imag) <= 1e-9 * abs(poles[i]) else poles[i].imag),
+            _clean(complex(poles[i])),
             float(numbers[0][i] / (2 * np.pi)),
             float(numbers[1][i] / (2 * np.pi)),
             float(numbers[2][i]),
@@ -75,6 +80,11 @@ def modes_of(found: Identification) -> tuple[Mode, ...]:
         )
         for i, partner in zip(keep, _partners(poles[keep], nominal), strict=True)
     )
+
+
+def _clean(pole: complex) -> complex:
+    """Without the imaginary part that rounding leaves on a real pole."""
+    return complex(pole.real, 0.0) if abs(pole.imag) <= 1e-9 * abs(pole) else pole
 
 
 def _partners(poles: np.ndarray, nominal: np.ndarray) -> list[complex | None]:
@@ -100,7 +110,7 @@ def poles_of(model: SecondOrderModel) -> np.ndarray:
     size = len(mass)
     lower = np.linalg.solve(mass, -np.hstack([stiffness, damping]))
     poles = np.linalg.eigvals(np.vstack([np.eye(size, 2 * size, size), lower]))
-    poles = poles[poles.imag >= 0]
+    poles = poles[np.imag(poles) >= 0]
     return poles[np.argsort(np.abs(poles))]
 
 

@@ -3,7 +3,8 @@
 import math
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-MISSING = "–"
+MISSING = "\N{EN DASH}"
+TIMES = " \N{MULTIPLICATION SIGN} "
 
 
 def power_of_ten(exponent: int) -> str:
@@ -12,7 +13,7 @@ def power_of_ten(exponent: int) -> str:
 
 def minus(text: str) -> str:
     """The same with the proper minus sign."""
-    return text.replace("-", "−")
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def exponent_of(value: float) -> int:
@@ -28,11 +29,11 @@ def significant(value: float, digits: int = 4) -> str:
     exponent = exponent_of(float(f"{value:.{digits - 1}e}"))
     if -4 <= exponent < 6:
         return minus(f"{value:.{max(digits - 1 - exponent, 0)}f}")
-    return minus(f"{value / 10.0**exponent:.{digits - 1}f}") + " × " + power_of_ten(exponent)
+    return minus(f"{value / 10.0**exponent:.{digits - 1}f}") + TIMES + power_of_ten(exponent)
 
 
 def with_std(value: float, std: float | None, digits: int = 5) -> str:
-    """value ± std, the deviation with two digits and the value with as many decimals, at most eight digits."""
+    """value ± std: the deviation with two digits, the value with as many decimals; at most eight digits."""
     if not math.isfinite(value):
         return MISSING
     if std is None or not math.isfinite(std) or std <= 0:
@@ -45,7 +46,7 @@ def with_std(value: float, std: float | None, digits: int = 5) -> str:
         places = max(decimals, 0)
         return minus(f"{value:.{places}f} ± {std:.{places}f}")
     scale, places = 10.0**exponent, max(decimals + exponent, 0)
-    return minus(f"({value / scale:.{places}f} ± {std / scale:.{places}f}) × ") + power_of_ten(exponent)
+    return minus(f"({value / scale:.{places}f} ± {std / scale:.{places}f})") + TIMES + power_of_ten(exponent)
 
 
 def change(value: float, reference: float) -> str:
@@ -58,7 +59,7 @@ def change(value: float, reference: float) -> str:
 
 def percent(share: float) -> str:
     """A share in percent, three significant digits."""
-    return f"{significant(100 * share, 3)} %" if math.isfinite(share) else MISSING
+    return f"{significant(100 * share, 3)}\N{NO-BREAK SPACE}%" if math.isfinite(share) else MISSING
 
 
 def plural(count: int, noun: str) -> str:

@@ -18,8 +18,10 @@ SHOWN = 6  # larger matrices are left to the files
 
 def print_summary(found: Identification, console: Console | None = None) -> None:
     """Modes, matrices, fit and warnings as rich tables, on standard output unless a console is given."""
-    console = console or Console()
-    console.print(f"\n[bold]{escape(found.nominal.name)}[/]: order {found.order}. {escape(found.order_reason)}")
+    console = Console() if console is None else console
+    console.print(
+        f"\n[bold]{escape(found.nominal.name)}[/]: order {found.order}. {escape(found.order_reason)}"
+    )
     console.print(_modes(found))
     for table in _matrices(found):
         console.print(table)

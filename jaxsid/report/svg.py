@@ -1,16 +1,17 @@
-"""A matplotlib figure as SVG to stand inside a page: text as text, colours that follow the page, own names."""
+"""A figure as SVG to stand inside a page: text as text, colours that follow the page, names of its own."""
 
 import hashlib
 import html
 import io
 import re
+from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
 
 from jaxsid.report.style import CSS_COLOURS
 
-SETTINGS = {"svg.fonttype": "none", "path.simplify_threshold": 0.3}
+SETTINGS: dict[Any, Any] = {"svg.hashsalt": "jaxsid", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
 REFERENCES = re.compile(r'(?:xlink:href="#|url\(#)([^")]+)')
 PATH = re.compile(r'\sd="([^"]*)"')
 LONG = re.compile(r"(\d\.\d\d)\d+")
@@ -20,7 +21,7 @@ IDENTITY = re.compile(r'\sid="([^"]+)"')
 def inline_svg(figure: Figure, alternative: str) -> str:
     """An <svg> element that scales with its place; `alternative` is read to those who cannot see it."""
     stream = io.StringIO()
-    with matplotlib.rc_context(SETTINGS | {"svg.hashsalt": "jaxsid"}):
+    with matplotlib.rc_context(SETTINGS):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = _short(stream.getvalue())
     text = _own_names(text, hashlib.sha256(text.encode()).hexdigest()[:8])

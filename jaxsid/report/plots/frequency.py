@@ -44,7 +44,7 @@ def frequency_figure(found: Identification, output: str, column: int = 0, record
     kind = sensor_kinds(found.nominal, (output,))[0]
     label(size, y=units_of(found.nominal).label(f"{kind} per force"))
     label(phase, y="phase (°)")
-    label(coherence, "frequency (Hz)", "coherence (–)")
+    label(coherence, "frequency (Hz)", "coherence (-)")
     legend(size)
     return figure
 
@@ -53,7 +53,9 @@ def frequency_range(found: Identification, fit: FrequencyFit) -> tuple[float, fl
     """From below the slowest mode to a little over the trusted band, or to four times the fastest mode."""
     f = np.asarray(fit.frequencies)
     positive = f[f > 0]
-    frequencies = np.asarray(found.modal.frequencies)[np.asarray(found.modal.poles).imag > 0] / (2 * np.pi)
+    frequencies = np.asarray(found.modal.frequencies)[np.imag(np.asarray(found.modal.poles)) > 0] / (
+        2 * np.pi
+    )
     fastest, slowest = (float(np.max(x, initial=0.0)) for x in (frequencies, frequencies[:1]))
     low = slowest / 4 if found.response.band is None else min(slowest / 4, float(found.response.band[0]))
     high = 4 * fastest if found.response.band is None else 1.1 * float(found.response.band[1])
@@ -63,7 +65,9 @@ def frequency_range(found: Identification, fit: FrequencyFit) -> tuple[float, fl
 
 def mark_modes(axes: np.ndarray, found: Identification, low: float, high: float) -> None:
     """Dotted lines at the modes, grey where the impulse response is not trusted."""
-    frequencies = np.asarray(found.modal.frequencies)[np.asarray(found.modal.poles).imag > 0] / (2 * np.pi)
+    frequencies = np.asarray(found.modal.frequencies)[np.imag(np.asarray(found.modal.poles)) > 0] / (
+        2 * np.pi
+    )
     for ax in axes:
         for frequency in frequencies[(frequencies >= low) & (frequencies <= high)]:
             ax.axvline(frequency, color=GREEN, linewidth=0.8, linestyle=(0, (1, 2)))

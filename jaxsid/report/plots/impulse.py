@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jaxsid.identification import Identification
 from jaxsid.report.envelope import envelope
-from jaxsid.report.style import BLUE, MUTED, label, legend, new_figure, scaled
+from jaxsid.report.style import BLUE, MUTED, label, legend, new_figure, scaled, title
 from jaxsid.report.units import sensor_kinds, units_of
 
 ROWS = 4  # outputs a figure shows
@@ -23,15 +23,22 @@ def impulse_figure(found: Identification, column: int = 0) -> Figure:
     samples = shown(modelled)
     time = np.arange(samples) * float(found.response.dt)
     height = 1.15 + 1.15 * len(outputs)
-    figure, axes = new_figure(f"impulse at {inputs[column]}", height, rows=len(outputs), between=0.32, sharex=True, top=0.62)
+    figure, axes = new_figure(
+        f"impulse at {inputs[column]}", height, rows=len(outputs), between=0.32, sharex=True, top=0.62
+    )
     units, kinds = units_of(found.nominal), sensor_kinds(found.nominal, outputs)
     for row, (name, kind) in enumerate(zip(outputs, kinds, strict=True)):
         ax = axes[row, 0]
         if estimated is not None:
             _curve(ax, time, estimated[:samples, row], color=MUTED, linewidth=1.9, label="estimated")
         _curve(ax, time, modelled[:samples, row], color=BLUE, linewidth=0.9, label="state-space model")
-        ax.set_title(name, fontsize=8.5, loc="left", pad=3)
-        scaled(ax, "y", f"({units.symbol(kind + ' per force')})", float(np.nanmax(np.abs(modelled[:samples, row]), initial=0.0)))
+        title(ax, name)
+        scaled(
+            ax,
+            "y",
+            f"({units.symbol(kind + ' per force')})",
+            float(np.nanmax(np.abs(modelled[:samples, row]), initial=0.0)),
+        )
     axes[0, 0].set_xlim(0, time[-1])
     label(axes[-1, 0], "time after the impulse (s)")
     legend(axes[0, 0], 2)

@@ -9,7 +9,7 @@ from jaxsid.checks import require
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.report.numbers import significant
-from jaxsid.report.style import BLUE, INK, ORANGE, label, new_figure
+from jaxsid.report.style import BLUE, INK, ORANGE, label, new_figure, title
 from jaxsid.report.units import units_of
 
 ANNOTATED = 6  # larger matrices are coloured only
@@ -18,7 +18,9 @@ SIGNED = LinearSegmentedColormap.from_list("signed", [ORANGE, "#f7f7f7", BLUE])
 
 def matrix_figure(found: Identification, which: str) -> Figure:
     """One of "mass", "damping" and "stiffness": nominal, identified and its standard deviation."""
-    require(found.matrices is not None, f"{found.nominal.name}: no matrices were identified, none can be shown.")
+    require(
+        found.matrices is not None, f"{found.nominal.name}: no matrices were identified, none can be shown."
+    )
     nominal = np.asarray(getattr(second_order(found.nominal), which))
     panels = [("nominal", nominal), ("identified", np.asarray(getattr(found.matrices, which)))]
     if found.matrices_std is not None:
@@ -32,7 +34,7 @@ def matrix_figure(found: Identification, which: str) -> Figure:
     )  # fmt: skip
     for ax, (name, values) in zip(axes[:, 0], panels, strict=True):
         _heat(ax, values, found.nominal.bodies)
-        ax.set_title(name, fontsize=8.5, loc="left", pad=3)
+        title(ax, name)
         label(ax, y="body")
     return figure
 
@@ -47,4 +49,4 @@ def _heat(ax: Axes, values: np.ndarray, bodies: tuple[str, ...]) -> None:
         ax.set_yticks(place, bodies)
     if len(values) <= ANNOTATED:
         for i, j in np.ndindex(values.shape):
-            ax.text(j, i, significant(values[i, j]), ha="center", va="center", fontsize=7.5, color=INK)
+            ax.text(j, i, significant(float(values[i, j])), ha="center", va="center", fontsize=7.5, color=INK)

@@ -38,7 +38,7 @@ def singular_value_figure(found: Identification) -> Figure:
     ax.plot(count[:n], values[:n], "o", color=BLUE, markersize=4, label=f"in the model, order {n}")
     ax.axvline(n + 0.5, color=ORANGE, linewidth=1, linestyle=(0, (4, 2)))
     log_scale(ax, "y")
-    label(ax, "number", "relative to the largest (–)")
+    label(ax, "number", "relative to the largest (-)")
     legend(ax, 1, inside="upper right")
     return figure
 

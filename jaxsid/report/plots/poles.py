@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from jaxsid.identification import Identification
 from jaxsid.report.modes import modes_of, nominal_poles, poles_of
-from jaxsid.report.style import BLUE, INK, MUTED, ORANGE, label, legend, new_figure, scaled
+from jaxsid.report.style import BLUE, INK, MUTED, ORANGE, legend, new_figure, scaled
 
 
 def pole_figure(found: Identification) -> Figure:
@@ -13,20 +13,21 @@ def pole_figure(found: Identification) -> Figure:
     figure, axes = new_figure("Poles", 3.2, top=0.62)
     ax = axes[0, 0]
     nominal = nominal_poles(found.nominal)
-    ax.plot(nominal.real, nominal.imag, "s", color=MUTED, fillstyle="none", markersize=6, label="nominal")
+    ax.plot(
+        np.real(nominal), np.imag(nominal), "s", color=MUTED, fillstyle="none", markersize=6, label="nominal"
+    )
     identified = np.array([mode.pole for mode in modes_of(found)])
-    real_std, imaginary_std = _deviations(found)
-    ax.errorbar(
-        identified.real, identified.imag, xerr=2 * real_std, yerr=2 * imaginary_std, fmt="o", color=BLUE,
-        markersize=4.5, elinewidth=1, capsize=2, label="identified",
-    )  # fmt: skip
+    xerr, yerr = (2 * std for std in _deviations(found))
+    look = {"color": BLUE, "markersize": 4.5, "elinewidth": 1, "capsize": 2, "label": "identified"}
+    ax.errorbar(np.real(identified), np.imag(identified), xerr=xerr, yerr=yerr, fmt="o", **look)
     if found.matrices is not None:
         poles = poles_of(found.matrices)
-        ax.plot(poles.real, poles.imag, "x", color=ORANGE, markersize=6, markeredgewidth=1.2, label="matrices")
+        look = {"color": ORANGE, "markersize": 6, "markeredgewidth": 1.2, "label": "matrices"}
+        ax.plot(np.real(poles), np.imag(poles), "x", **look)
     ax.axvline(0, color=INK, linewidth=0.7)
     every = np.concatenate([nominal, identified])
-    scaled(ax, "x", "real part (1/s)", float(np.abs(every.real).max(initial=0.0)))
-    scaled(ax, "y", "imaginary part (rad/s)", float(np.abs(every.imag).max(initial=0.0)))
+    for axis, text, part in (("x", "real part (1/s)", np.real), ("y", "imaginary part (rad/s)", np.imag)):
+        scaled(ax, axis, text, float(np.abs(part(every)).max(initial=0.0)))
     ax.margins(0.1)
     legend(ax)
     return figure

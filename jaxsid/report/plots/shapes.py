@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from jaxsid.identification import Identification
 from jaxsid.report.modes import Mode, displacement_shapes, modes_of
 from jaxsid.report.numbers import significant
-from jaxsid.report.style import BLUE, MUTED, ORANGE, label, new_figure
+from jaxsid.report.style import BLUE, MUTED, ORANGE, label, new_figure, title
 from jaxsid.report.units import sensor_kinds
 
 NAMED = 12  # sensors beyond this are numbered
@@ -18,15 +18,15 @@ def mode_shape_figure(found: Identification, first: int = 0, count: int = 4) -> 
     modes = modes_of(found)[first : first + count]
     shapes = displacement_shapes(found, sensor_kinds(found.nominal, found.outputs))
     figure, axes = new_figure(
-        "Mode shapes", 0.95 + 1.42 * len(modes), rows=len(modes), columns=2, ratios=None, between=0.42, top=0.5,
-        beside=0.5, left=0.55,
+        "Mode shapes", 0.95 + 1.42 * len(modes), rows=len(modes), columns=2, between=0.42, beside=0.5,
+        left=0.55, top=0.5,
     )  # fmt: skip
     for row, mode in enumerate(modes):
-        _bars(axes[row, 0], shapes[:, mode.index].real, found.outputs)
+        _bars(axes[row, 0], np.real(shapes[:, mode.index]), found.outputs)
         _plane(axes[row, 1], shapes[:, mode.index])
-        axes[row, 0].set_title(_title(mode, first + row), fontsize=8.5, loc="left", pad=3)
+        title(axes[row, 0], _title(mode, first + row))
     label(axes[-1, 0], x="sensor")
-    label(axes[-1, 1], x="real part (–)")
+    label(axes[-1, 1], x="real part (-)")
     return figure
 
 
@@ -48,7 +48,7 @@ def _bars(ax: Axes, values: np.ndarray, names: tuple[str, ...]) -> None:
     if len(values) <= NAMED:
         long = max(map(len, names)) * len(names) > 24
         ax.set_xticks(place, names, rotation=30 if long else 0, ha="right" if long else "center")
-    label(ax, y="relative (–)")
+    label(ax, y="relative (-)")
 
 
 def _plane(ax: Axes, shape: np.ndarray) -> None:
@@ -57,10 +57,10 @@ def _plane(ax: Axes, shape: np.ndarray) -> None:
     ax.plot(np.cos(turn), np.sin(turn), color=MUTED, linewidth=0.6)
     for component in shape:
         ax.plot([0, component.real], [0, component.imag], color=ORANGE, linewidth=1)
-    ax.plot(shape.real, shape.imag, "o", color=ORANGE, markersize=3)
+    ax.plot(np.real(shape), np.imag(shape), "o", color=ORANGE, markersize=3)
     ax.set_xlim(-1.15, 1.15)
     ax.set_ylim(-1.15, 1.15)
     ax.set_aspect("equal")
     ax.set_xticks([-1, 0, 1])
     ax.set_yticks([-1, 0, 1])
-    label(ax, y="imaginary (–)")
+    label(ax, y="imaginary (-)")

@@ -19,18 +19,20 @@ def time_figure(found: Identification, output: str, record: int = 0) -> Figure:
     time = np.arange(len(measured)) * float(given.dt)
     kind = sensor_kinds(found.nominal, (output,))[0]
     title = output if len(found.records) == 1 else f"{output} in {given.name}"
-    figure, axes = new_figure(title, 4.4, rows=3, ratios=(1, 1.25, 0.8), between=0.36)
-    text = units_of(found.nominal).label(kind)
+    figure, axes = new_figure(title, 4.4, rows=3, ratios=(1, 1.25, 0.8), between=0.36, left=0.74)
+    text = units_of(found.nominal).label(kind).replace(" (", "\n(")
     size = float(np.nanmax(np.abs(measured), initial=0.0))
     near = close_look(measured, _width(found, float(given.dt), len(time)))
     _curves(axes[0, 0], time, measured, modelled)
     _curves(axes[1, 0], time[near], measured[near], modelled[near], 1.2)
-    axes[0, 0].axvspan(time[near][0], time[near][-1], color=ORANGE, alpha=0.18, linewidth=0)
+    axes[0, 0].axvspan(time[near][0], time[near][-1], color=ORANGE, alpha=0.6, linewidth=1, zorder=5)
     for ax in axes[:2, 0]:
         scaled(ax, "y", text, size)
     legend(axes[0, 0], 2)
-    _residual(axes[2, 0], time, measured - modelled, float(found.noise_floor[column]) * np.nanstd(measured))
-    scaled(axes[2, 0], "y", "residual\n" + text[text.index("(") :], float(np.nanmax(np.abs(measured - modelled))))
+    _residual(axes[2, 0], time, measured - modelled, float(found.noise_floor[column] * np.nanstd(measured)))
+    scaled(
+        axes[2, 0], "y", "residual\n" + text[text.index("(") :], float(np.nanmax(np.abs(measured - modelled)))
+    )
     label(axes[2, 0], "time (s)")
     return figure
 
@@ -50,7 +52,9 @@ def _width(found: Identification, dt: float, samples: int) -> int:
     return int(min(samples, np.clip(periods, 60, 600)))
 
 
-def _curves(ax: Axes, time: np.ndarray, measured: np.ndarray, modelled: np.ndarray, width: float = 0.8) -> None:
+def _curves(
+    ax: Axes, time: np.ndarray, measured: np.ndarray, modelled: np.ndarray, width: float = 0.8
+) -> None:
     ax.plot(*envelope(time, measured), color=MUTED, linewidth=1.9 * width, label="measured")
     ax.plot(*envelope(time, modelled), color=BLUE, linewidth=0.9 * width, label="model")
     ax.set_xlim(time[0], time[-1])
