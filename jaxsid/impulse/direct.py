@@ -9,7 +9,8 @@ the
   noise seen in the record so little that the answer is good;
 - regularized: Bayesian estimate with a prior that says how smooth an impulse response is and how it decays,
 the
-  TC and second-order kernels (T. Chen, H. Ohlsson, L. Ljung, Automatica 48 (2012) 1525-1535), solved in a
+  DC kernel and its second-order kin (T. Chen, H. Ohlsson, L. Ljung, Automatica 48 (2012) 1525-1535), solved
+  in a
   Krylov
   space. The feedthrough is free: an accelerometer's is a spike that no smooth prior would allow.
 """
@@ -31,9 +32,14 @@ from jaxsid.impulse.protocol import Ensemble, as_records, returned_samples, stac
 from jaxsid.impulse.toeplitz import convolve, fft_length, simulate, spectrum, substitute
 from jaxsid.records import ImpulseResponse, Record
 
-# (order of smoothness, decay time as a share of the taps) of the priors that are tried, the likeliest is
-# kept.
-PRIORS = ((1, 0.2), (1, 1.0), (1, 1e6), (2, 0.2), (2, 1.0))
+# (order of smoothness, correlation length in samples, decay time as a share of the taps) of the priors that
+# are
+# tried, the likeliest is kept.
+PRIORS = (
+    *((2.0, length, decay) for length in (3.0, 10.0, 30.0, 100.0) for decay in (0.1, 0.3)),
+    (2.0, 300.0, 1e6),
+    (1.0, 1000.0, 1e6),
+)
 # The exact solution is taken where noise makes up less than this share of it.
 EXACT_ENOUGH = 1e-3
 
@@ -105,16 +111,23 @@ class Direct(eqx.Module):
 
 
 def smooth_prior(theta: Array, z: Float[Array, "taps inputs"]) -> Float[Array, "taps inputs"]:
-    """z, white, to a response that is free at 0, then smooth of the given order, and decays.
+    """z, white, to a response that is free at 0, then smooth, and decays.
 
-    Order 1: h_k = sum_(j >= k) w_j z_j (the TC kernel), order 2: once more. The value at the end is free.
+    For k > 0: h_k = exp(-k / decay) sum_(j >= k) f_(j-k) z_j, f_i = exp(-i / length) for order 1 (the DC
+    kernel),
+    (1 + i) exp(-i / length) for order 2. The filter runs backwards, so that the first taps have full size.
     """
-    order, decay = theta
+    order, correlation, decay = theta
     m = z.shape[0] - 1
-    weight = jnp.exp(-jnp.arange(m) / (decay * max(m, 1))).at[-1:].multiply(max(m, 1) ** 0.5)
-    once = jnp.cumsum((weight[:, None] * z[1:])[::-1], axis=0)[::-1]
-    twice = jnp.cumsum(once[::-1], axis=0)[::-1]
-    return jnp.concatenate([z[:1], jnp.where(order > 1.5, twice, once)])
+    if m == 0:
+        return z
+    k = jnp.arange(m, dtype=z.dtype)
+    kernel = jnp.exp(-k / correlation) * jnp.where(order > 1.5, 1 + k, 1)
+    kernel = kernel / jnp.linalg.norm(kernel)
+    length = fft_length(2 * m)
+    spec = jnp.fft.rfft(kernel, length)[:, None] * jnp.fft.rfft(z[:0:-1], length, axis=0)
+    smooth = jnp.fft.irfft(spec, length, axis=0)[:m][::-1]
+    return jnp.concatenate([z[:1], smooth * jnp.exp(-k / (decay * m))[:, None]])
 
 
 @eqx.filter_jit

@@ -92,7 +92,8 @@ def substitute(
     seen = (jnp.arange(s) < s - late.max())[:, None, None]
     h = jnp.zeros((s, u.shape[2], y.shape[2]), y.dtype)
     for _ in range(3):
-        h = h + jnp.where(seen, _product(g, y - _product(u, h, length), length), 0)
+        gap = jnp.where(seen, y - _product(u, h, length), 0)
+        h = h + jnp.where(seen, _product(g, gap, length), 0)
     return h.swapaxes(1, 2), jnp.sqrt(jnp.sum(jnp.where(seen, g, 0) ** 2))
 
 

@@ -27,11 +27,12 @@ from jaxsid.impulse.protocol import Ensemble, as_records, returned_samples, stac
 from jaxsid.impulse.toeplitz import simulate, substitute
 from jaxsid.records import ImpulseResponse, Record
 
-# A coefficient of level j at time t is expected to be of the size 2^(slope min(j, top)) exp(-t / (decay
-# length)):
-# (top, decay) of the priors that are tried, the likeliest is kept. Levels above `top` are slower than the
-# system.
-PRIORS = ((4, 0.1), (4, 1.0), (6, 0.1), (6, 1.0), (99, 1.0))
+# A coefficient of level j is expected to be of the size 2^(slope min(j, top)): levels above `top` are slower
+# than
+# the system. The response has the envelope exp(-k / decay), decay as a share of the record. (top, decay) of
+# the
+# priors that are tried, the likeliest is kept.
+PRIORS = ((4.0, 0.1), (4.0, 0.3), (6.0, 0.1), (6.0, 0.3), (4.0, 1e6), (6.0, 1e6), (99.0, 1e6))
 
 
 class Wavelet(eqx.Module):
@@ -73,8 +74,8 @@ class Wavelet(eqx.Module):
         if self.keep is None:
             whole = ensemble.u.shape[0] == r and len(set(ensemble.lengths)) == 1
             steps = min(self.steps, ensemble.mask.size, s * r)
-            # Twice as long: the periodic seam then lies beyond the record, or the strong first taps would leak
-            # through it into the weakly determined last ones.
+            # Twice as long: the periodic seam then lies beyond the record, or the strong first taps would
+            # leak through it into the weakly determined last ones.
             shape = (self.wavelet, 2 * length, level + 1 if self.level is None else level)
             h, noise, exact = _shrunk(ensemble, shape=shape, slope=self.slope, steps=steps, whole=whole)
         else:
@@ -119,13 +120,14 @@ def _shrunk(
     """All coefficients: exact where that is good enough, else under the prior."""
     wavelet, length, level = shape
     s = ensemble.u.shape[1]
-    levels, when = _places(length, level)
+    levels, lag = levels_of(length, level), np.arange(length)[:, None] / s
     noise = noise_level(ensemble.u, ensemble.y, ensemble.mask)
 
     def prior(theta, z):
         top, decay = theta
-        size = 2.0 ** (slope * (jnp.minimum(levels, top) - level)) * jnp.exp(-when / decay)
+        size = 2.0 ** (slope * (jnp.minimum(levels, top) - level))
         taps = idwt(z[1:] * size[:, None].astype(z.dtype), wavelet=wavelet, level=level)
+        taps = taps * jnp.exp(-lag / decay).astype(z.dtype)
         return jnp.concatenate([z[:1], taps])
 
     def regularized():
@@ -139,14 +141,6 @@ def _shrunk(
     good = good_enough(ensemble, h, noise * amplification)
     h, left = jax.lax.cond(good, lambda: (h, noise), regularized)
     return h, left, good
-
-
-def _places(length: int, level: int) -> tuple[np.ndarray, np.ndarray]:
-    """Level of each coefficient, and its place in time as a share of the length."""
-    levels = levels_of(length, level)
-    first = {j: np.argmax(levels == j) for j in range(level, 0, -1)} | {level: length >> level}
-    start = np.array([0 if i < (length >> level) else first[j] for i, j in enumerate(levels)])
-    return levels, (np.arange(length) - start) * 2.0**levels / length
 
 
 @eqx.filter_jit
