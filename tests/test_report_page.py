@@ -9,6 +9,7 @@ import pytest
 from report_fixture import WARNING, identification, without_matrices
 
 from jaxsid.checks import InputError
+from jaxsid.mechanics.lumped import Input, Sensor, lumped_model
 from jaxsid.records import ImpulseResponse, Record
 from jaxsid.report.frame import (
     Card,
@@ -24,7 +25,8 @@ from jaxsid.report.frame import (
     page,
     picture,
 )
-from jaxsid.report.html import report_page, write_report
+from jaxsid.report.html import check_installed, write_report
+from jaxsid.report.identification_page import report_page
 from jaxsid.report.modes import modes_of
 from jaxsid.report.numbers import with_std
 from jaxsid.report.plots import pole_figure
@@ -163,6 +165,38 @@ def test_report_with_nothing_but_modes(found):
 def test_a_missing_folder_is_told(found, tmp_path):
     with pytest.raises(InputError, match="no folder"):
         write_report(found, tmp_path / "missing" / "report.html")
+
+
+def test_a_missing_package_is_told():
+    with pytest.raises(InputError, match=r"needs no_such_package.*jaxsid\[plot\]"):
+        check_installed("jinja2", "no_such_package")
+
+
+def test_many_sensors_show_the_worst(found):
+    """Forty sensors: tables and figures keep to the worst."""
+    count, (record,) = 40, found.records
+    names = tuple(f"s{i}" for i in range(count))
+    bodies = tuple(f"b{i}" for i in range(count))
+    nominal = lumped_model(
+        bodies,
+        np.ones(count),
+        sensors=[Sensor(s, b, "velocity") for s, b in zip(names, bodies, strict=True)],
+        inputs=[Input("force", "b0")],
+        name="plate",
+    )
+    y = np.tile(np.asarray(record.y)[:, :1], (1, count))
+    many = dataclasses.replace(
+        without_matrices(found), nominal=nominal, outputs=names, frequency_fit=(),
+        records=(Record(record.u, y, record.dt, inputs=("force",), outputs=names),),
+        predictions=(0.9 * y,), train_nrmse=np.linspace(0.01, 0.4, count), noise_floor=np.full(count, 0.01),
+        modal=dataclasses.replace(without_matrices(found).modal, shapes=np.ones((count, 6), complex)),
+        time_response=np.ones((50, count, 1)),
+        response=ImpulseResponse(np.ones((50, count, 1)), record.dt),
+    )  # fmt: skip
+    text = Reader(report_page(many)).text
+    assert "The 20 worst of 40 sensors" in text
+    assert "6 of 40 are shown, the worst fitting" in text
+    assert "and 28 more" in text
 
 
 def test_the_frame_serves_other_reports(found):

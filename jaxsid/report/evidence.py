@@ -1,5 +1,6 @@
 """Second part of the report: the figures that back the findings, the records, and how it was computed."""
 
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -64,16 +65,19 @@ def time_section(found: Identification) -> Section:
         "standard deviations (dashed)."
     )
     pictures = tuple(
-        picture(time_figure(found, output, record), _fit_caption(found, output)) for record, output in kept
+        picture(time_figure(found, output, record), _fit_caption(found, output, record))
+        for record, output in kept
     )
     left_out = _left_out(len(places), len(kept), "the worst fitting")
     return Section("Response in time", (*left_out, Gallery(pictures, note)))
 
 
-def _fit_caption(found: Identification, output: str) -> str:
+def _fit_caption(found: Identification, output: str, record: int) -> str:
     row = found.outputs.index(output)
     misfit, floor = percent(float(found.train_nrmse[row])), percent(float(found.noise_floor[row]))
-    return f"{output}: misfit {misfit} over all records; noise alone would leave {floor}."
+    return (
+        f"{output} in {found.records[record].name}. Misfit {misfit}, all records; noise alone leaves {floor}."
+    )
 
 
 def _left_out(there: int, shown: int, which: str) -> tuple[Text, ...]:
@@ -223,9 +227,13 @@ def _record_row(record: Record) -> tuple[str | Cell, ...]:
         str(samples),
         significant(1 / dt, 5),
         significant(samples * dt, 4),
-        Cell(", ".join(inputs), tone="wide"),
-        Cell(", ".join(record.outputs), tone="wide"),
+        Cell(_listed(inputs), tone="wide"),
+        Cell(_listed(record.outputs), tone="wide"),
     )
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def method_section(found: Identification) -> Section:

@@ -5,7 +5,7 @@ import numpy as np
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
-from jaxsid.report.modes import Mode, modes_of
+from jaxsid.report.modes import Mode, modes_of, worst_fits
 from jaxsid.report.numbers import MISSING, TIMES, change, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
@@ -142,8 +142,10 @@ def _matrix(found: Identification, which: str) -> Table:
     )
     units = units_of(found.nominal)
     title = f"{units.name(which).capitalize()} ({units.symbol(which)})"
-    note = "± one standard deviation; below: nominal value, change." if which == MATRICES[-1] else ""
-    return Table(("", *bodies), rows, title, note)
+    note = "Small: nominal value, change."
+    if deviation is not None:
+        note = f"± one standard deviation. {note}"
+    return Table(("", *bodies), rows, title, note if which == MATRICES[-1] else "")
 
 
 def _beside(value: float, nominal: float) -> str:
@@ -181,8 +183,8 @@ def _pair(value, nominal) -> tuple[str, Cell]:
 def fit_section(found: Identification) -> Section:
     """How closely the model follows each sensor."""
     rows = tuple(
-        _fit_row(name, float(nrmse), float(floor))
-        for name, nrmse, floor in zip(found.outputs, found.train_nrmse, found.noise_floor, strict=True)
+        _fit_row(found.outputs[i], float(found.train_nrmse[i]), float(found.noise_floor[i]))
+        for i in worst_fits(found)
     )
     header = ("Sensor", "Misfit (NRMSE)", "Noise floor", "Ratio", "Reading")
     note = (
@@ -190,6 +192,8 @@ def fit_section(found: Identification) -> Section:
         "Noise floor: what a perfect model would leave. A ratio near 1 means that nothing but noise is "
         "left; well above, the system does something that a linear model of this kind does not."
     )
+    if len(rows) < len(found.outputs):
+        note = f"The {len(rows)} worst of {len(found.outputs)} sensors. " + note
     return Section("Fit", (Table(header, rows, "", note),))
 
 

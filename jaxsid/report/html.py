@@ -1,25 +1,11 @@
 """The report of an identification: one HTML file that needs nothing else."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
+from jaxsid.checks import require
 from jaxsid.files.atomic import write_atomically
 from jaxsid.identification import Identification
-from jaxsid.report.evidence import (
-    cbsi_section,
-    frequency_section,
-    impulse_section,
-    matrix_pictures,
-    method_section,
-    order_section,
-    records_section,
-    shapes_section,
-    software,
-    time_section,
-)
-from jaxsid.report.findings import fit_section, key_findings, matrices_section
-from jaxsid.report.frame import Gallery, Section, page
-from jaxsid.report.numbers import plural, significant
-from jaxsid.report.units import units_of
 
 
 def write_report(found: Identification, path: Path | str) -> None:
@@ -30,46 +16,20 @@ def write_report(found: Identification, path: Path | str) -> None:
         path: file to write.
 
     Raises:
-        InputError: the folder is missing or cannot be written to.
+        InputError: the folder is missing or cannot be written to; matplotlib or jinja2 is not installed.
     """
+    check_installed("matplotlib", "jinja2")
+    from jaxsid.report.identification_page import report_page  # slow to load
+
     text = report_page(found)
     write_atomically(path, lambda stream: stream.write(text))
 
 
-def report_page(found: Identification) -> str:
-    """The report as text."""
-    title = f"Identification of {found.nominal.name}"
-    return page(
-        title, _subtitle(found), report_sections(found), f"Made with {software()}. All values in SI units."
-    )
-
-
-def report_sections(found: Identification) -> tuple[Section, ...]:
-    """All sections, for a report that holds more than this."""
-    matrices, heat_maps = matrices_section(found), matrix_pictures(found)
-    if heat_maps:
-        matrices = Section(matrices.title, (*matrices.blocks, Gallery(heat_maps)))
-    return (
-        key_findings(found),
-        matrices,
-        fit_section(found),
-        time_section(found),
-        frequency_section(found),
-        shapes_section(found),
-        order_section(found),
-        impulse_section(found),
-        cbsi_section(found),
-        records_section(found),
-        method_section(found),
-    )
-
-
-def _subtitle(found: Identification) -> str:
-    seconds = sum(len(record.y) * float(record.dt) for record in found.records)
-    kind = {True: "rotation", False: "translation", None: "translation or rotation"}[
-        units_of(found.nominal).turning
-    ]
-    return (
-        f"{plural(len(found.records), 'record')}, {significant(seconds, 3)} s in all, "
-        f"{plural(len(found.outputs), 'sensor')}; units of {kind}"
+def check_installed(*packages: str) -> None:
+    """Raise InputError where a package that the reports need is missing."""
+    missing = [name for name in packages if find_spec(name) is None]
+    require(
+        not missing,
+        f"The report needs {' and '.join(missing)}, not installed here. Install it: pip install "
+        "'jaxsid[plot]'.",
     )

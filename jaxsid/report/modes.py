@@ -1,4 +1,4 @@
-"""The modes of an identification one by one, each with its nominal counterpart, for tables and JSON."""
+"""The modes of an identification one by one, each with its nominal counterpart; shapes, worst fits."""
 
 from typing import NamedTuple
 
@@ -112,6 +112,12 @@ def poles_of(model: SecondOrderModel) -> np.ndarray:
     poles = np.linalg.eigvals(np.vstack([np.eye(size, 2 * size, size), lower]))
     poles = poles[np.imag(poles) >= 0]
     return poles[np.argsort(np.abs(poles))]
+
+
+def worst_fits(found: Identification, most: int = 20) -> list[int]:
+    """Outputs in their order; where there are too many for a table, those that fit worst."""
+    worst = np.argsort(-np.nan_to_num(np.asarray(found.train_nrmse)), kind="stable")[:most]
+    return sorted(int(i) for i in worst)
 
 
 def displacement_shapes(found: Identification, kinds: tuple[str, ...]) -> np.ndarray:

@@ -43,7 +43,7 @@ def new_figure(
     sharex: bool = False,
 ) -> tuple[Figure, np.ndarray]:
     """A figure with margins in inches and an array (rows, columns) of styled axes."""
-    figure = Figure(figsize=(WIDTH, height), facecolor="none")
+    figure = Figure(figsize=(WIDTH, height), facecolor="white")
     inner = (height - top - bottom) / rows, (WIDTH - left - right) / columns
     axes = figure.subplots(
         rows,
@@ -62,9 +62,14 @@ def new_figure(
     )
     for ax in axes.flat:
         style_axes(ax)
-    figure.text(0.08 / WIDTH, 1 - 0.08 / height, title, ha="left", va="top", fontsize=FONT + 1, color=INK,
-                fontweight="bold")  # fmt: skip
+    look = {"fontsize": FONT + 1, "color": INK, "fontweight": "bold"}
+    figure.text(0.08 / WIDTH, 1 - 0.08 / height, shortened(title), ha="left", va="top", **look)
     return figure, axes
+
+
+def shortened(text: str, most: int = 44) -> str:
+    """The text, without its middle where it is too long for a title."""
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most // 2 - 1) :]}"
 
 
 def style_axes(ax: Axes) -> None:

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
-from jaxsid.report.modes import modes_of
+from jaxsid.report.modes import modes_of, worst_fits
 from jaxsid.report.numbers import change, percent, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
@@ -73,6 +73,7 @@ def _entry(value: float, std: float | None, nominal: float) -> str:
 
 def _fit(found: Identification) -> Table:
     table = _table("Fit", "sensor", "NRMSE", "noise floor")
-    for name, nrmse, floor in zip(found.outputs, found.train_nrmse, found.noise_floor, strict=True):
-        table.add_row(escape(name), percent(float(nrmse)), percent(float(floor)))
+    for i in worst_fits(found):
+        floor = percent(float(found.noise_floor[i]))
+        table.add_row(escape(found.outputs[i]), percent(float(found.train_nrmse[i])), floor)
     return table

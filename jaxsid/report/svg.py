@@ -22,7 +22,7 @@ def inline_svg(figure: Figure, alternative: str) -> str:
     """An <svg> element that scales with its place; `alternative` is read to those who cannot see it."""
     stream = io.StringIO()
     with matplotlib.rc_context(SETTINGS):
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(stream, format="svg", facecolor="none", metadata={"Date": None, "Creator": None})
     text = _short(stream.getvalue())
     text = _own_names(text, hashlib.sha256(text.encode()).hexdigest()[:8])
     for colour, variable in CSS_COLOURS.items():

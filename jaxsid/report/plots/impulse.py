@@ -24,7 +24,7 @@ def impulse_figure(found: Identification, column: int = 0) -> Figure:
     time = np.arange(samples) * float(found.response.dt)
     height = 1.15 + 1.15 * len(outputs)
     figure, axes = new_figure(
-        f"impulse at {inputs[column]}", height, rows=len(outputs), between=0.32, sharex=True, top=0.62
+        f"Impulse at {inputs[column]}", height, rows=len(outputs), between=0.32, sharex=True, top=0.62
     )
     units, kinds = units_of(found.nominal), sensor_kinds(found.nominal, outputs)
     for row, (name, kind) in enumerate(zip(outputs, kinds, strict=True)):

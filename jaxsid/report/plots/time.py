@@ -1,5 +1,7 @@
 """Measured and modelled response in time: all of it, a close look, and what is left."""
 
+from pathlib import PurePath
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,7 +20,7 @@ def time_figure(found: Identification, output: str, record: int = 0) -> Figure:
     modelled = np.asarray(found.predictions[record])[:, column]
     time = np.arange(len(measured)) * float(given.dt)
     kind = sensor_kinds(found.nominal, (output,))[0]
-    title = output if len(found.records) == 1 else f"{output} in {given.name}"
+    title = output if len(found.records) == 1 else f"{output} in {PurePath(given.name).name}"
     figure, axes = new_figure(title, 4.4, rows=3, ratios=(1, 1.25, 0.8), between=0.36, left=0.74)
     text = units_of(found.nominal).label(kind).replace(" (", "\n(")
     size = float(np.nanmax(np.abs(measured), initial=0.0))
