@@ -14,7 +14,7 @@ from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Sensor, lumped_model, second_order
 from jaxsid.modal import modal
 from jaxsid.report import plots
-from jaxsid.report.modes import displacement_shapes, modes_of
+from jaxsid.report.modes import connecting, displacement_shapes, modes_of
 
 FIGURES = {
     "time": lambda found: plots.time_figure(found, "acc2"),
@@ -148,3 +148,13 @@ def test_many_sensors_and_real_poles():
     assert [mode.real for mode in modes_of(found)] == [True, False]
     assert "real" in plots.mode_shape_figure(found).axes[0].get_title(loc="left")
     assert plots.pole_figure(found).axes
+
+
+def test_elements_are_read_off_the_matrices(found):
+    """The matrices of the fixture are 1.001 times the true stiffness, the deviation that of the entry."""
+    value, std = connecting(found, "stiffness", ("middle", "base"))
+    assert value == pytest.approx(30e3 * 1.001)
+    assert std == pytest.approx(0.004 * 30e3 + 1e-3 * 70e3)
+    value, std = connecting(found, "stiffness", ("ground", "base"))
+    assert value == pytest.approx(40e3 * 1.001)
+    assert np.isnan(std)

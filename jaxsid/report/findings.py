@@ -3,9 +3,9 @@
 import numpy as np
 
 from jaxsid.identification import Identification
-from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.mechanics.lumped import second_order
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
-from jaxsid.report.modes import Mode, modes_of, worst_fits
+from jaxsid.report.modes import Mode, connecting, modes_of, worst_fits
 from jaxsid.report.numbers import MISSING, TIMES, change, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
@@ -82,20 +82,23 @@ def modes_table(found: Identification) -> Table:
 
 
 def _mode_row(number: int, mode: Mode, rated: bool) -> tuple[str | Cell, ...]:
-    damping, nominal = 100 * mode.damping_ratio, 100 * mode.nominal_damping_ratio
-    kind = "real pole" if mode.real else ""
     row = (
-        Cell(str(number), kind),
+        Cell(str(number), f"real pole, {significant(mode.pole.real)} 1/s" if mode.real else ""),
         with_std(mode.frequency, mode.frequency_std),
         Cell(significant(mode.nominal_frequency), _known_change(mode.frequency, mode.nominal_frequency)),
-        Cell(
-            with_std(damping, 100 * mode.damping_ratio_std),
-            "unstable" if damping < 0 else "",
-            tone="warning" if damping < 0 else "",
-        ),
-        Cell(significant(nominal), _known_change(damping, nominal)),
     )
-    return row + (_ratings(mode) if rated else ())
+    return row + _damping(mode) + (_ratings(mode) if rated else ())
+
+
+def _damping(mode: Mode) -> tuple[Cell, Cell]:
+    """Damping ratio and that of the nominal model in percent; a real pole has none."""
+    value, nominal = 100 * mode.damping_ratio, 100 * mode.nominal_damping_ratio
+    unstable = mode.pole.real > 0
+    remark, tone = ("unstable", "warning") if unstable else ("", "")
+    if mode.real:
+        return Cell(MISSING, remark, tone=tone), Cell("")
+    found = Cell(with_std(value, 100 * mode.damping_ratio_std), remark, tone=tone)
+    return found, Cell(significant(nominal), _known_change(value, nominal))
 
 
 def _known_change(value: float, nominal: float) -> str:
@@ -153,31 +156,45 @@ def _beside(value: float, nominal: float) -> str:
 
 
 def _elements(found: Identification) -> Table | None:
-    """Bodies and connections one by one, where both models are made of them."""
-    new, old = found.identified, found.nominal
-    if (
-        new is None
-        or new.matrices is not None
-        or old.matrices is not None
-        or new.connections != old.connections
-    ):
+    """Bodies and connections one by one, read off the matrices, where the nominal model is made of them."""
+    model = found.nominal
+    if found.matrices is None or model.matrices is not None:
         return None
-    units = units_of(old)
-    rows = [(body, *_pair(new.mass[i], old.mass[i]), "", "") for i, body in enumerate(old.bodies)]
-    rows += [_connection(new, old, i) for i in range(len(old.connections))]
+    units = units_of(model)
+    mass, std = np.diag(np.asarray(found.matrices.mass)), found.matrices_std
+    bodies = zip(
+        model.bodies,
+        mass,
+        np.full(len(mass), np.nan) if std is None else np.diag(std.mass),
+        model.mass,
+        strict=True,
+    )
+    rows = [(name, *_beside_nominal(*(float(x) for x in row)), "", "") for name, *row in bodies]
+    rows += [_connection(found, i) for i in range(len(model.connections))]
     header = ("Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal")
     title = f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
-    return Table(header, tuple(rows), title, "Below each nominal value: the change from it.")
+    note = (
+        "Read off the matrices: a connection between two bodies is their entry off the diagonal with "
+        "the sign changed, one to ground the sum of a row. Below each nominal value: the change from "
+        "it."
+    )
+    return Table(header, tuple(rows), title, note)
 
 
-def _connection(new: LumpedModel, old: LumpedModel, i: int) -> tuple[str | Cell, ...]:
-    name = Cell(old.connections[i].name, f" {MISSING} ".join(old.connections[i].between))
-    return name, *_pair(new.stiffness[i], old.stiffness[i]), *_pair(new.damping[i], old.damping[i])
+def _connection(found: Identification, i: int) -> tuple[str | Cell, ...]:
+    connection, model = found.nominal.connections[i], found.nominal
+    name = Cell(connection.name, f" {MISSING} ".join(connection.between))
+    if sum(set(other.between) == set(connection.between) for other in model.connections) > 1:
+        return name, "in parallel with another", "", "", ""
+    stiffness, damping = (
+        _beside_nominal(*connecting(found, which, connection.between), float(getattr(model, which)[i]))
+        for which in ("stiffness", "damping")
+    )
+    return name, *stiffness, *damping
 
 
-def _pair(value, nominal) -> tuple[str, Cell]:
-    value, nominal = float(value), float(nominal)
-    return significant(value, 5), Cell(significant(nominal), _known_change(value, nominal))
+def _beside_nominal(value: float, std: float, nominal: float) -> tuple[str, Cell]:
+    return with_std(value, std), Cell(significant(nominal), _known_change(value, nominal))
 
 
 def fit_section(found: Identification) -> Section:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsid.identification import Identification
-from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.mechanics.lumped import GROUND, LumpedModel, second_order
 from jaxsid.records import SecondOrderModel
 
 INDICATORS = ("mac", "emac", "mpc", "cmi", "msv")
@@ -118,6 +118,21 @@ def worst_fits(found: Identification, most: int = 20) -> list[int]:
     """Outputs in their order; where there are too many for a table, those that fit worst."""
     worst = np.argsort(-np.nan_to_num(np.asarray(found.train_nrmse)), kind="stable")[:most]
     return sorted(int(i) for i in worst)
+
+
+def connecting(found: Identification, which: str, between: tuple[str, str]) -> tuple[float, float]:
+    """Stiffness or damping between two bodies, or a body and ground, as the matrix has it; its deviation.
+
+    -K_ij, and for the ground the sum of row i, whose deviation is not known.
+    """
+    values = np.asarray(getattr(found.matrices, which))
+    rows = [found.nominal.bodies.index(end) for end in between if end != GROUND]
+    if len(rows) == 1:
+        return float(values[rows[0]].sum()), float("nan")
+    i, j = rows
+    deviation = found.matrices_std
+    std = float("nan") if deviation is None else float(np.asarray(getattr(deviation, which))[i, j])
+    return -float(values[i, j]), std
 
 
 def displacement_shapes(found: Identification, kinds: tuple[str, ...]) -> np.ndarray:

@@ -9,7 +9,7 @@ from rich.table import Table
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.report.modes import modes_of, worst_fits
-from jaxsid.report.numbers import change, percent, significant, with_std
+from jaxsid.report.numbers import MISSING, change, percent, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
 
@@ -45,7 +45,7 @@ def _modes(found: Identification) -> Table:
             f"{number}{' real' if mode.real else ''}",
             with_std(mode.frequency, mode.frequency_std),
             change(mode.frequency, mode.nominal_frequency),
-            with_std(100 * mode.damping_ratio, 100 * mode.damping_ratio_std),
+            MISSING if mode.real else with_std(100 * mode.damping_ratio, 100 * mode.damping_ratio_std),
             *(significant(mode.indicators[name], 3) for name in ("mac", "emac", "mpc", "msv")),
         )
     return table
