@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from jaxsid.files.model_toml import read_model, write_model
     from jaxsid.files.record_file import read_record, read_records
     from jaxsid.identification import Identification
-    from jaxsid.identify import identify
+    from jaxsid.pipeline.identify import identify
     from jaxsid.impulse.direct import Direct
     from jaxsid.impulse.ensemble import WaveletEnsemble
     from jaxsid.impulse.estimate import impulse_response
@@ -48,7 +48,7 @@ _HOMES = {
     "jaxsid.files.model_toml": ("read_model", "write_model"),
     "jaxsid.files.record_file": ("read_record", "read_records"),
     "jaxsid.identification": ("Identification",),
-    "jaxsid.identify": ("identify",),
+    "jaxsid.pipeline.identify": ("identify",),
     "jaxsid.impulse.direct": ("Direct",),
     "jaxsid.impulse.ensemble": ("WaveletEnsemble",),
     "jaxsid.impulse.estimate": ("impulse_response",),

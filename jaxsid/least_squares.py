@@ -34,16 +34,30 @@ class _State(NamedTuple):
     finished: Array
 
 
+def forward(residual: Callable[[Array], Array]) -> Callable[[Array], tuple[Array, Array]]:
+    """A function that returns the residual and its Jacobian, by forward differentiation."""
+
+    def evaluate(value: Array) -> tuple[Array, Array]:
+        jacobian, r = jax.jacfwd(lambda v: (residual(v),) * 2, has_aux=True)(value)
+        return r.ravel(), jacobian.reshape(-1, len(value))
+
+    return evaluate
+
+
 def levenberg_marquardt(
-    residual: Callable[[Array], Array], start: Float[Array, " n"], *, max_steps: int, tolerance: float = 1e-10
+    evaluate: Callable[[Array], tuple[Array, Array]],
+    start: Float[Array, " n"],
+    *,
+    max_steps: int,
+    tolerance: float = 1e-10,
 ) -> Minimum:
-    """The unknowns that minimize half the sum of squares of `residual`, by Levenberg and Marquardt.
+    """The unknowns that minimize half a sum of squares, by Levenberg and Marquardt.
 
     Steps solve (J'J + l diag(J'J)) d = -J'r; l falls tenfold after a step that helps and rises tenfold after
-    one that does not, which is then undone. Only J'J and J'r are kept, so memory does not grow with J twice.
+    one that does not, which is then undone. Only J'J and J'r are kept from step to step.
 
     Args:
-        residual: maps the unknowns to the weighted residual, any shape.
+        evaluate: maps the unknowns to the weighted residual (equations,) and its Jacobian (equations, n).
         start: (n,).
         max_steps: most evaluations.
         tolerance: stop when a helpful step lowers the cost by less than this part.
@@ -51,10 +65,8 @@ def levenberg_marquardt(
     Source: D. Marquardt, J. SIAM 11 (1963).
     """
 
-    def evaluate(value: Array) -> tuple[Array, Array, Array]:
-        jacobian = jax.jacfwd(lambda v: (residual(v),) * 2, has_aux=True)
-        j, r = jacobian(value)
-        j, r = j.reshape(-1, len(value)), r.ravel()
+    def products(value: Array) -> tuple[Array, Array, Array]:
+        r, j = evaluate(value)
         return 0.5 * r @ r, j.T @ j, j.T @ r
 
     def advance(state: _State) -> _State:
@@ -62,7 +74,7 @@ def levenberg_marquardt(
         normal = state.product / scale / scale[:, None] + state.damping * jnp.eye(len(start))
         step = -jnp.linalg.solve(normal, state.gradient / scale) / scale
         value = state.value + step
-        cost, product, gradient = evaluate(value)
+        cost, product, gradient = products(value)
         better = cost < state.cost
         gained = (state.cost - cost) / jnp.maximum(state.cost, jnp.finfo(start.dtype).tiny)
         finished = jnp.where(better, gained < tolerance, state.damping > 1e8)
@@ -77,6 +89,6 @@ def levenberg_marquardt(
             finished,
         )
 
-    first = _State(start, *evaluate(start), jnp.asarray(1e-3, start.dtype), jnp.array(1), jnp.array(False))
+    first = _State(start, *products(start), jnp.asarray(1e-3, start.dtype), jnp.array(1), jnp.array(False))
     last = jax.lax.while_loop(lambda s: ~s.finished & (s.steps < max_steps), advance, first)
     return Minimum(last.value, last.cost, last.product, last.steps)

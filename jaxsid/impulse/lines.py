@@ -135,7 +135,7 @@ def record_lines(
     owner = np.repeat(np.eye(len(records)), counts, axis=0)
     padding = _bucket(sum(counts)) - sum(counts)
     z, omega, u, y, weight = (np.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)) for a in lines)
-    z[sum(counts) :] = 1j
+    z[sum(counts) :], omega[sum(counts) :] = z[0], omega[0]  # padding must not hit a pole
     return Lines(
         z=jnp.asarray(z),
         omega=jnp.asarray(omega),

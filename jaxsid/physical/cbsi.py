@@ -70,18 +70,21 @@ def cbsi(
     return _cbsi(model, kinds, places, solution == "symmetric", rigid, complement, loose.shape[1] > 0)
 
 
-def visible_states(sensors: Sequence[str], rigid: int, loose: int) -> int:
-    """Number of states that sensors of these kinds, one a body, can see.
+def visible_states(bodies: int, sensors: Sequence[str], rigid: int, loose: int) -> int:
+    """Number of states that sensors of these kinds can see.
+
+    Velocity sensors miss the position of what no spring holds, accelerometers also its velocity where no
+    damper resists it.
 
     Args:
+        bodies: number of degrees of freedom.
         sensors: kind of each sensor.
         rigid: number of displacement patterns that no spring resists.
         loose: number of those that no damper resists either.
     """
-    bodies, kinds = len(sensors), set(sensors)
-    if "displacement" in kinds:
+    if "displacement" in sensors:
         return 2 * bodies
-    return 2 * bodies - rigid - (loose if kinds == {"acceleration"} else 0)
+    return 2 * bodies - rigid - (0 if "velocity" in sensors else loose)
 
 
 def _patterns(patterns: ArrayLike | None, bodies: int) -> np.ndarray:
@@ -106,7 +109,7 @@ def _check(
     )
     require(loose in (0, rigid), "`loose` must hold all patterns of `rigid`, or none.")
     require(not rigid or len(set(kinds)) == 1, "with rigid-body motion the sensors must all be of one kind")
-    expected = visible_states(kinds, rigid, loose)
+    expected = visible_states(outputs, kinds, rigid, loose)
     require(
         order == expected,
         f"{outputs} bodies seen by {', '.join(dict.fromkeys(kinds))} sensors have {expected} visible states, but the "

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.least_squares import levenberg_marquardt
+from jaxsid.least_squares import forward, levenberg_marquardt
 
 STEPS = 60
 
@@ -62,7 +62,7 @@ def symmetric_positive(
         return inverse @ jnp.concatenate([motion, impulse], axis=1) / states_size
 
     x = jnp.concatenate([f[i] / s for f, i, s in zip(factors, lower, sizes, strict=True)])
-    M, D, K = matrices(levenberg_marquardt(residual, x, max_steps=STEPS).value)
+    M, D, K = matrices(levenberg_marquardt(forward(residual), x, max_steps=STEPS).value)
     return M, D, K
 
 

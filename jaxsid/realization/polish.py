@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jaxsid.impulse.lines import Lines, laguerre_shift
-from jaxsid.least_squares import levenberg_marquardt
+from jaxsid.impulse.lines import Lines, laguerre_pole, laguerre_shift
+from jaxsid.least_squares import forward, levenberg_marquardt
 from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, Realization
 
@@ -36,13 +36,15 @@ class Polished(NamedTuple):
         noise: (lines, outputs) standard deviation of the noise on each line, smoothed over frequency.
         residual: (lines, outputs) what remains of each line.
         transient: (lines, outputs) the part of each line due to the initial and final states.
-        pole_covariance: (n, n) covariance of the denominator coefficients.
+        denominators: (n,) a_1, a_2 of each pole pair in the Laguerre shift, then minus the odd real pole.
+        pole_covariance: (n, n) covariance of the denominators.
     """
 
     realization: Realization
     noise: Float[Array, "lines outputs"]
     residual: Complex[Array, "lines outputs"]
     transient: Complex[Array, "lines outputs"]
+    denominators: Float[Array, " n"]
     pole_covariance: Float[Array, "n n"]
 
 
@@ -54,8 +56,9 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
         lines: in-band lines of the records.
         rounds: how often the noise spectrum is estimated anew and the fit repeated.
     """
-    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(realization.pole)))
-    noise, pole = _level(lines.y, lines.weight), realization.pole
+    pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
+    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(pole)))
+    noise = _level(lines.y, lines.weight)
     noise = jnp.broadcast_to(jnp.sqrt((noise**2).mean(axis=0)), noise.shape)
     for _ in range(rounds + 1):
         theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole)
@@ -63,7 +66,7 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
     h = _markov_parameters(theta, response[:, : lines.u.shape[1]], samples)
     ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="polished in band")
     refined = era(ir, order=len(theta), rows=samples // 2 - 1, cols=samples // 2 - 1)
-    return Polished(refined, noise, residual, transient, covariance)
+    return Polished(refined, noise, residual, transient, theta, covariance)
 
 
 def _denominators(A: np.ndarray, pole: float) -> np.ndarray:
@@ -132,7 +135,7 @@ def _solve(design: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]
 def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
-    found = levenberg_marquardt(lambda t: _projected_residual(t, args), theta, max_steps=STEPS)
+    found = levenberg_marquardt(forward(lambda t: _projected_residual(t, args)), theta, max_steps=STEPS)
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
     design = _design(theta, lines, pole)
     weight = lines.weight / noise

@@ -1,0 +1,127 @@
+"""How well the identified model repeats the records, in time and in frequency."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxsid.checks import JaxsidError
+from jaxsid.identification import FrequencyFit
+from jaxsid.impulse.lines import Lines
+from jaxsid.impulse.spectra import frequency_response
+from jaxsid.mechanics.first_order import physical_displacement_velocity
+from jaxsid.mechanics.hold import discretise
+from jaxsid.mechanics.simulate import estimate_initial_state, simulate_linear
+from jaxsid.records import ContinuousModel, Record, SecondOrderModel
+
+
+class TimeFit(NamedTuple):
+    """Predictions, one a record, and the errors of each output over all records."""
+
+    predictions: tuple[Array, ...]
+    nrmse: np.ndarray
+    floor: np.ndarray
+
+
+def time_fit(
+    model: ContinuousModel,
+    records: Sequence[Record],
+    outputs: Sequence[str],
+    lines: Lines,
+    noise: Array,
+    at_rest: bool,
+) -> TimeFit:
+    """Simulate each record from an estimated initial state and compare.
+
+    Args:
+        model: identified, its outputs in the order of `outputs`.
+        records: what was measured.
+        outputs: names of the model's outputs.
+        lines: in-band lines of the records.
+        noise: (lines, outputs) standard deviation of the noise on each line.
+        at_rest: start from rest instead.
+    """
+    predictions, left, floor, size = [], *(np.zeros(len(outputs)) for _ in range(3))
+    owner = np.where(np.asarray(lines.weight).any(axis=1), np.asarray(lines.record).argmax(axis=1), -1)
+    for i, r in enumerate(records):
+        rows = [outputs.index(n) for n in r.outputs]
+        seen = ContinuousModel(model.A, model.B, model.C[np.array(rows)], model.D[np.array(rows)])
+        y = np.asarray(_prediction(seen, r, at_rest))
+        predictions.append(jnp.asarray(y))
+        measured, samples = np.asarray(r.y), len(y)
+        error = measured - y
+        inside = 2 * (np.asarray(noise)[owner == i][:, rows] ** 2).sum(axis=0)
+        left[rows] += (error**2).sum(axis=0)
+        floor[rows] += inside + _outside_band(error - error.mean(axis=0), float(r.dt), np.asarray(lines.band))
+        size[rows] += samples * measured.var(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return TimeFit(tuple(predictions), np.sqrt(left / size), np.sqrt(np.minimum(floor, left) / size))
+
+
+def _prediction(model: ContinuousModel, record: Record, at_rest: bool) -> Array:
+    sampled = discretise(model, record.dt, hold=record.hold)
+    if at_rest:
+        return simulate_linear(sampled, record.u)
+    state = estimate_initial_state(sampled, record.u, record.y).state
+    return simulate_linear(sampled, record.u, initial_state=state)
+
+
+def _outside_band(error: np.ndarray, dt: float, band: np.ndarray) -> np.ndarray:
+    """Sum of squares of the error at frequencies that the inputs do not excite, where all of it is noise."""
+    f = np.fft.rfftfreq(len(error), dt)
+    outside = (f < band[0]) | (f > band[1])
+    power = np.abs(np.fft.rfft(error, axis=0)[outside]) ** 2
+    return 2 * power.sum(axis=0) / len(error)
+
+
+def frequency_fits(
+    records: Sequence[Record],
+    outputs: Sequence[str],
+    model: ContinuousModel,
+    matrices: SecondOrderModel | None,
+    band: Sequence[float],
+) -> tuple[FrequencyFit, ...]:
+    """Measured (H1) and modelled frequency responses of every record, within and around the band.
+
+    Args:
+        records: what was measured.
+        outputs: names of the model's outputs.
+        model: identified state-space model.
+        matrices: identified mass, damping and stiffness, or None.
+        band: Hz.
+    """
+    fits = []
+    for r in records:
+        try:
+            measured = frequency_response(r)
+        except JaxsidError:  # too short to average: the time plots remain
+            continue
+        f = np.asarray(measured.frequencies)
+        near = np.flatnonzero((f >= 0.5 * band[0]) & (f <= 1.5 * band[1]) & (f > 0))
+        columns = [outputs.index(n) for n in r.outputs]
+        h = np.full((len(near), len(outputs), r.u.shape[1]), np.nan, complex)
+        coherence = np.full((len(near), len(outputs)), np.nan)
+        h[:, columns] = np.asarray(measured.H)[near]
+        coherence[:, columns] = np.asarray(measured.multiple_coherence)[near]
+        physical = None if matrices is None else physical_displacement_velocity(matrices)
+        fits.append(
+            FrequencyFit(
+                frequencies=jnp.asarray(f[near]),
+                measured=jnp.asarray(h),
+                coherence=jnp.asarray(coherence),
+                realization=_response(model, r, f[near]),
+                matrices=None if physical is None else _response(physical, r, f[near]),
+            )
+        )
+    return tuple(fits)
+
+
+def _response(model: ContinuousModel, record: Record, f: np.ndarray) -> Array:
+    """Frequency response of the sampled, held system at f (Hz)."""
+    half = 1j * np.pi * f * float(record.dt)
+    z = (1 + half) / (1 - half) if record.hold[0] == "band" else np.exp(2 * half)
+    sampled = discretise(model, record.dt, hold=record.hold)
+    A, B, C, D = (np.asarray(x) for x in (sampled.A, sampled.B, sampled.C, sampled.D))
+    return jnp.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None]) + D)

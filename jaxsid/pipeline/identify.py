@@ -1,0 +1,182 @@
+"""The whole chain: records to impulse response, order, state-space model, modes, mass, damping and stiffness."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsid.checks import InsufficientDataError, check_excitation, require
+from jaxsid.identification import Identification, MatrixDeviation
+from jaxsid.impulse.lines import Lines, record_lines
+from jaxsid.impulse.protocol import ImpulseMethod
+from jaxsid.mechanics.lumped import LumpedModel, Matrices, lumped_model
+from jaxsid.mechanics.simulate import markov_parameters
+from jaxsid.pipeline.fit import frequency_fits, time_fit
+from jaxsid.pipeline.matrices import POOR, Found, find_matrices
+from jaxsid.pipeline.modes import final_modes
+from jaxsid.pipeline.setting import Setting, setting
+from jaxsid.pipeline.state_space import StateSpace, state_space
+from jaxsid.realization.stabilization import Stabilization, stabilization
+from jaxsid.records import Record, SecondOrderModel
+
+LONGEST_RESPONSE = 8192  # samples of the impulse response that is reported
+Progress = Callable[[str], None]
+
+
+def identify(
+    model: LumpedModel,
+    records: Record | Sequence[Record],
+    *,
+    order: int | None = None,
+    band: tuple[float, float] | None = None,
+    method: ImpulseMethod | None = None,
+    realization: Literal["era", "era_dc"] = "era",
+    initial: Literal["estimate", "rest"] = "estimate",
+    progress: Progress | None = None,
+) -> Identification:
+    """Impulse response, state-space model, modes and M, D, K of a system, from records of its inputs and outputs.
+
+    M q'' + D q' + K q = B u, from Y(k) = G(z_k) U(k) + transient on the lines k that the inputs excite: observer
+    Markov parameters, ERA or ERA/DC, maximum-likelihood poles, CBSI, and the symmetric M, D, K that fit the
+    lines best. The model's numbers are compared with, never weighed; where CBSI fails they are a starting
+    point.
+
+    Args:
+        model: bodies, connections, inputs and sensors; SI units.
+        records: one or more; they may differ in length, rate and in which sensors they hold.
+        order: number of states; None takes what bodies and sensors promise.
+        band: frequencies (Hz) to use; None finds what the inputs excite.
+        method: estimator of the impulse response, such as `InBand()` (the default) or `Wavelet()`.
+        realization: "era" or "era_dc".
+        initial: "estimate" each record's initial state, or take it to be at "rest", for the comparison in time.
+        progress: called with a line of text as each stage begins.
+
+    Returns:
+        Identification.
+
+    Raises:
+        InputError: records, names or options that cannot be used.
+        InsufficientDataError: the records cannot support an answer.
+
+    Source: thesis ch. 2-5; R. Pintelon and J. Schoukens, System Identification, 2nd ed. (lines and weights).
+    """
+    say = progress or (lambda text: None)
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose estimate or rest.")
+    system = setting(model, records)
+    for r in records if len(model.inputs) == 1 else ():
+        check_excitation(r)
+    check_enough(records, order or system.visible)
+    say("impulse response in the excited band")
+    lines = record_lines(records, outputs=system.outputs, band=band)
+    space = state_space(
+        records, lines, order=order, expected=system.visible, realization=realization, method=method
+    )
+    say("mass, damping and stiffness")
+    found = find_matrices(model, system, space) if len(space.raw.A) == system.visible else _not_this_order(system)
+    explained = found.fit is not None and float(found.fit.misfit) < POOR
+    say("modes, stabilization, fit")
+    final = final_modes(space, found.model if explained else None, found.fit if explained else None)
+    times = time_fit(
+        final.continuous, records, system.outputs, space.lines, space.polished.noise, initial == "rest"
+    )
+    return Identification(
+        nominal=model,
+        records=records,
+        outputs=system.outputs,
+        response=space.response,
+        time_response=markov_parameters(final.realization, samples=_response_samples(records)),
+        realization=final.realization,
+        continuous=final.continuous,
+        order=len(space.raw.A),
+        order_reason=space.order_reason,
+        stabilization=_stabilization(space, system.visible),
+        modal=final.modal,
+        frequency_std=final.frequency_std,
+        damping_ratio_std=final.damping_ratio_std,
+        cbsi=found.cbsi,
+        matrices=found.model,
+        matrices_std=None if found.fit is None else _deviation(found),
+        identified=None if found.model is None else identified_model(model, found.model),
+        predictions=times.predictions,
+        train_nrmse=jnp.asarray(times.nrmse),
+        noise_floor=jnp.asarray(times.floor),
+        frequency_fit=frequency_fits(
+            records, system.outputs, final.continuous, found.model, [float(f) for f in lines.band]
+        ),
+        warnings=(*_about_records(records, lines), *space.warnings, *found.warnings, *_missing(model, system)),
+    )
+
+
+def _not_this_order(system: Setting) -> Found:
+    return Found(None, None, None, (
+        f"The bodies and sensors of the model have {system.visible} visible states: with another order there is no "
+        "mass, damping and stiffness.",
+    ))  # fmt: skip
+
+
+def _deviation(found: Found) -> MatrixDeviation:
+    assert found.fit is not None
+    return MatrixDeviation(*found.fit.deviation)
+
+
+def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedModel:
+    """The nominal model with its numbers replaced by identified matrices.
+
+    Args:
+        nominal: gives bodies, inputs and sensors.
+        found: M, D, K.
+    """
+    symmetric = [np.asarray(x) for x in (found.mass, found.damping, found.stiffness)]
+    mass, damping, stiffness = (0.5 * (x + x.T) for x in symmetric)
+    return lumped_model(
+        nominal.bodies,
+        matrices=Matrices(jnp.asarray(mass), jnp.asarray(damping), jnp.asarray(stiffness)),
+        inputs=nominal.inputs,
+        sensors=nominal.sensors,
+        tolerance=nominal.tolerance,
+        name=nominal.name,
+    )
+
+
+def _response_samples(records: Sequence[Record]) -> int:
+    return min(max(r.u.shape[0] for r in records), LONGEST_RESPONSE)
+
+
+def _stabilization(space: StateSpace, expected: int) -> Stabilization:
+    """Orders up to twice the expected one and some, from the window of the impulse response."""
+    half = (space.response.h.shape[0] - 1) // 2
+    most = min(2 * expected + 8, half)
+    return stabilization(space.response, tuple(range(2, most + 1)), rows=half, cols=half)
+
+
+def _about_records(records: Sequence[Record], lines: Lines) -> tuple[str, ...]:
+    low, high = (float(f) for f in lines.band)
+    nyquist = min(0.5 / float(r.dt) for r in records)
+    if high < 0.5 * nyquist:
+        return (
+            f"The inputs excite {low:.3g} to {high:.3g} Hz of the {nyquist:.4g} Hz that the sampling rate could show; "
+            "all estimates come from that band.",
+        )
+    return ()
+
+
+def _missing(model: LumpedModel, system: Setting) -> tuple[str, ...]:
+    absent = [s.name for s in model.sensors if s.name not in system.outputs]
+    return (f"No record holds {', '.join(absent)}.",) if absent else ()
+
+
+def check_enough(records: Sequence[Record], order: int) -> None:
+    """Raise InsufficientDataError where the records are shorter than any model of this order needs.
+
+    Args:
+        records: of one system.
+        order: number of states.
+    """
+    samples = sum(r.u.shape[0] for r in records)
+    needed = 10 * order
+    if samples < needed:
+        raise InsufficientDataError(
+            f"{samples} samples cannot determine a model of {order} states: record at least {needed}."
+        )

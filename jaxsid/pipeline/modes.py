@@ -1,0 +1,128 @@
+"""Final poles with indicators and standard deviations."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxsid.impulse.lines import laguerre_pole
+from jaxsid.mechanics.first_order import physical_displacement_velocity
+from jaxsid.mechanics.hold import continuous, discretise, shift_to_laguerre
+from jaxsid.mechanics.recursion import markov
+from jaxsid.modal import modal
+from jaxsid.physical.inband_fit import MatrixFit
+from jaxsid.pipeline.state_space import StateSpace
+from jaxsid.realization.era import era
+from jaxsid.records import ContinuousModel, ImpulseResponse, Indicators, ModalModel, Realization, SecondOrderModel
+
+WINDOW = 100  # block rows and columns of the realization of a model's own response
+
+
+class FinalModes(NamedTuple):
+    """The model that is reported, its modes, and standard deviations of frequencies (rad/s) and damping ratios."""
+
+    realization: Realization
+    continuous: ContinuousModel
+    modal: ModalModel
+    frequency_std: Array
+    damping_ratio_std: Array
+
+
+def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: MatrixFit | None) -> FinalModes:
+    """Modes of the fitted matrices where these explain the records, else of the state-space model.
+
+    MAC, EMAC and MPC always come from the realization of the measured impulse response, since a model is
+    perfectly coherent with itself.
+
+    Args:
+        space: the state-space model.
+        matrices: fitted mass, damping and stiffness, None where they do not explain the records.
+        fit: their covariance.
+    """
+    if matrices is None or fit is None:
+        realization, model = space.polished.realization, space.model
+    else:
+        realization = _minimal(matrices, space)
+        model = continuous(realization)
+    measured, own = modal(space.raw), modal(realization)
+    indicators = _nearest(measured, own)
+    own = eqx.tree_at(lambda m: m.indicators, own, indicators, is_leaf=lambda x: x is None)
+    if matrices is None or fit is None:
+        slopes = _slopes_of_denominators(space, np.asarray(own.poles))
+        covariance = np.asarray(space.polished.pole_covariance)
+    else:
+        slopes, covariance = _slopes_of_matrices(matrices, fit, np.asarray(own.poles)), np.asarray(fit.covariance)
+    frequency, ratio = _deviations(np.asarray(own.poles), slopes, covariance)
+    return FinalModes(realization, model, own, jnp.asarray(frequency), jnp.asarray(ratio))
+
+
+def _minimal(matrices: SecondOrderModel, space: StateSpace) -> Realization:
+    """The visible states of M, D, K: ERA of its own Markov parameters in the Laguerre shift."""
+    lines = space.lines
+    pole = laguerre_pole(float(lines.band[1]), float(lines.dt))
+    sampled = discretise(physical_displacement_velocity(matrices), lines.dt, hold=lines.hold)
+    shifted = shift_to_laguerre(sampled.A, sampled.B, sampled.C, sampled.D, pole)
+    h = _markov(*shifted, 2 * WINDOW + 1)
+    ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="fitted matrices")
+    return era(ir, order=len(space.raw.A), rows=WINDOW - 1, cols=WINDOW - 1)
+
+
+_markov = eqx.filter_jit(markov)
+
+
+def _nearest(measured: ModalModel, own: ModalModel) -> Indicators | None:
+    if measured.indicators is None:
+        return None
+    distance = np.abs(np.asarray(own.poles)[:, None] - np.asarray(measured.poles))
+    index = distance.argmin(axis=1)
+    return jax.tree.map(lambda x: x[index], measured.indicators)
+
+
+def _slopes_of_matrices(matrices: SecondOrderModel, fit: MatrixFit, poles: np.ndarray) -> np.ndarray:
+    """d pole / d unknown = -phi' (s^2 dM + s dD + dK) phi / phi' (2 s M + D) phi, (poles, unknowns)."""
+    M, D, K = (np.asarray(x) for x in fit.matrices)
+    dM, dD, dK = (np.asarray(x) for x in fit.slopes)
+    rows = []
+    for s in poles:
+        phi = np.linalg.svd(M * s**2 + D * s + K)[2][-1].conj()
+        change = np.einsum("i,ijp,j->p", phi, dM * s**2 + dD * s + dK, phi)
+        rows.append(-change / (phi @ (2 * s * M + D) @ phi))
+    return np.stack(rows)
+
+
+def _slopes_of_denominators(space: StateSpace, poles: np.ndarray) -> np.ndarray:
+    """d pole / d coefficient of w^2 + a_1 w + a_2 (pairs first, then an odd real root), (poles, coefficients)."""
+    theta = np.asarray(space.polished.denominators)
+    pairs = len(theta) // 2
+    a = float(space.polished.realization.pole)
+    z = np.exp(poles * float(space.lines.dt))
+    if space.lines.hold[0] == "band":
+        half = poles * float(space.lines.dt) / 2
+        z = (1 + half) / (1 - half)
+    w = (z - a) / (1 - a * z)
+    quadratic = theta[: 2 * pairs].reshape(pairs, 2)
+    misfit = np.abs(w[:, None] ** 2 + quadratic[:, 0] * w[:, None] + quadratic[:, 1])
+    misfit = np.concatenate([misfit, np.abs(w[:, None] + theta[2 * pairs :])], axis=1)
+    # z from w, then s from z
+    dz = (1 - a**2) / (1 + a * w) ** 2
+    ds = dz / (z * float(space.lines.dt)) if space.lines.hold[0] != "band" else dz * (1 - half) ** 2 / float(space.lines.dt)
+    slopes = np.zeros((len(poles), len(theta)), complex)
+    for i, section in enumerate(misfit.argmin(axis=1)):
+        if section < pairs:
+            slope = -1 / (2 * w[i] + quadratic[section, 0])
+            slopes[i, 2 * section : 2 * section + 2] = slope * w[i] * ds[i], slope * ds[i]
+        else:
+            slopes[i, pairs + section] = -ds[i]
+    return slopes
+
+
+def _deviations(poles: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations of abs(s) and -real(s) / abs(s)."""
+    size = np.maximum(np.abs(poles), np.finfo(float).tiny)
+    frequency = (slopes * poles.conj()[:, None]).real / size[:, None]
+    ratio = -slopes.real / size[:, None] + (poles.real / size**2)[:, None] * frequency
+    spread = lambda x: np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", x, covariance, x), 0.0))  # noqa: E731
+    return spread(frequency), spread(ratio)

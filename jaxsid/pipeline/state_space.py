@@ -1,0 +1,135 @@
+"""Records to a state-space model: impulse response, order, ERA or ERA/DC, refinement against the lines."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsid.checks import InsufficientDataError, require
+from jaxsid.impulse.inband import observer_response
+from jaxsid.impulse.lines import Lines
+from jaxsid.impulse.protocol import ImpulseMethod
+from jaxsid.mechanics.hold import continuous, discretise
+from jaxsid.realization.era import era
+from jaxsid.realization.era_dc import era_dc
+from jaxsid.realization.order import select_order
+from jaxsid.realization.polish import Polished, polish
+from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
+
+# Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
+LAGS = 5
+
+
+class StateSpace(NamedTuple):
+    """State-space model of the records, and how it was reached.
+
+    Attributes:
+        response: estimated impulse response.
+        raw: realization of that response.
+        polished: refined against the lines, with noise and residual.
+        model: the refined realization in continuous time.
+        lines: the lines, all brought to the common sampling interval.
+        order_reason: in words.
+        warnings: what went less than well.
+    """
+
+    response: ImpulseResponse
+    raw: Realization
+    polished: Polished
+    model: ContinuousModel
+    lines: Lines
+    order_reason: str
+    warnings: tuple[str, ...]
+
+
+def state_space(
+    records: Sequence[Record],
+    lines: Lines,
+    *,
+    order: int | None,
+    expected: int,
+    realization: Literal["era", "era_dc"] = "era",
+    method: ImpulseMethod | None = None,
+) -> StateSpace:
+    """Estimate, realize and refine.
+
+    Args:
+        records: of one system.
+        lines: their in-band lines.
+        order: number of states; None takes what the model promises.
+        expected: number of states that the model promises.
+        realization: "era" or "era_dc".
+        method: estimator of the impulse response; None for the in-band observer.
+
+    Raises:
+        InputError: an unknown realization, an order that does not fit the data.
+        InsufficientDataError: no stable fit of that order.
+    """
+    require(realization in ("era", "era_dc"), f"realization '{realization}' is unknown; choose era or era_dc.")
+    response = observer_response(lines) if method is None else method(records, None)
+    order_used = expected if order is None else order
+    raw = _realize(response, order_used, realization)
+    reason = _reason(raw, order, expected)
+    polished = polish(raw, lines)
+    if not bool(jnp.isfinite(polished.realization.A).all()):
+        raise InsufficientDataError(
+            f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
+            "order, widen the band of the excitation, or lengthen the record."
+        )
+    if len(set(lines.record_dt)) > 1:
+        lines = _common_rate(lines, polished.realization)
+        polished = polish(polished.realization, lines)
+    return StateSpace(
+        response, raw, polished, continuous(polished.realization), lines, reason, _warnings(polished.realization)
+    )
+
+
+def _realize(response: ImpulseResponse, order: int, realization: str) -> Realization:
+    half = (response.h.shape[0] - 1) // 2
+    if realization == "era":
+        return era(response, order=order, rows=half, cols=half)
+    reach = response.h.shape[0] - 2 - 2 * (LAGS - 1)
+    return era_dc(response, order=order, rows=reach // 3, cols=reach - reach // 3 - LAGS, lags=LAGS, first_lag=1)
+
+
+def _reason(raw: Realization, order: int | None, expected: int) -> str:
+    values = np.asarray(raw.singular_values)
+    choice = select_order(values, expected=expected)
+    if order is not None:
+        return f"order {order} was asked for; the singular values suggest: {choice.reason}"
+    own = select_order(values)
+    agree = "agree" if own.order == expected else f"alone would suggest {own.order}"
+    return (
+        f"The model's bodies and sensors have {expected} visible states; the singular values {agree} "
+        f"({own.reason.rstrip('.')})."
+    )
+
+
+def _warnings(found: Realization) -> tuple[str, ...]:
+    growing = np.abs(np.linalg.eigvals(np.asarray(found.A))).max()
+    slack = 1e-6
+    if growing > 1 + slack:
+        return (f"A pole is unstable (abs(z) = {growing:.6g}): a free body, active feedback, or too high an order.",)
+    return ()
+
+
+def _common_rate(lines: Lines, found: Realization) -> Lines:
+    """Outputs as they would be had every record been sampled, and its inputs held, at the common interval."""
+    model = continuous(found)
+    y = np.array(lines.y)
+    omega, owner = np.asarray(lines.omega), np.asarray(lines.record).argmax(axis=1)
+    for i, dt in enumerate(lines.record_dt):
+        if dt == float(lines.dt) or lines.hold[0] == "band":
+            continue
+        rows = np.flatnonzero(owner == i)
+        own = discretise(model, dt, hold=lines.hold)
+        excess = _response(own, np.exp(1j * omega[rows] * dt)) - _response(found, np.asarray(lines.z)[rows])
+        y[rows] -= np.einsum("kor,kr->ko", excess, np.asarray(lines.u)[rows])
+    return eqx.tree_at(lambda x: x.y, lines, jnp.asarray(y * (np.asarray(lines.weight) > 0)))
+
+
+def _response(model: Realization, z: np.ndarray) -> np.ndarray:
+    A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
+    return C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None]) + D
