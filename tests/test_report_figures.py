@@ -155,6 +155,7 @@ def test_elements_are_read_off_the_matrices(found):
     value, std = connecting(found, "stiffness", ("middle", "base"))
     assert value == pytest.approx(30e3 * 1.001)
     assert std == pytest.approx(0.004 * 30e3 + 1e-3 * 70e3)
+    assert connecting(found, "stiffness", ("top", "ground"))[0] == 0
     value, std = connecting(found, "stiffness", ("ground", "base"))
     assert value == pytest.approx(40e3 * 1.001)
     assert np.isnan(std)

@@ -155,7 +155,7 @@ def test_report_with_nothing_but_modes(found):
         frequency_std=np.full(6, np.nan), damping_ratio_std=np.full(6, np.nan),
     )  # fmt: skip
     reader = Reader(report_page(bare))
-    assert "No warnings" in reader.text
+    assert "No warnings." in reader.text
     assert "Laguerre" in reader.text
     assert "nan" not in re.sub(r"domi?nan|nominal|resonan", "", reader.text)
     assert "acc2 in roving" in reader.text

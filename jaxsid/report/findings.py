@@ -35,7 +35,10 @@ def _cards(found: Identification) -> tuple[Card, ...]:
         fit = f"{found.outputs[worst]}; noise alone leaves {percent(floor)}"
     largest = MISSING if worst is None else percent(float(found.train_nrmse[worst]))
     seen = [mode.frequency for mode in modes if not mode.real]
-    span = f"{significant(min(seen), 3)} to {significant(max(seen), 3)} Hz" if seen else "no vibration mode"
+    span = "no vibration mode"
+    if seen:
+        ends = dict.fromkeys(significant(x, 3) for x in (min(seen), max(seen)))
+        span = f"{' to '.join(ends)} Hz"
     matrices = ("not found", "see the warnings")
     if found.matrices is not None:
         size = str(len(found.matrices.mass))
@@ -60,7 +63,7 @@ def _worst(found: Identification) -> int | None:
 
 def _warnings(found: Identification) -> Notice:
     if not found.warnings:
-        return Notice("No warnings: every check of the result passed.", (), "good")
+        return Notice("No warnings.", (), "good")
     return Notice(plural(len(found.warnings), "warning"), found.warnings)
 
 
@@ -75,8 +78,9 @@ def modes_table(found: Identification) -> Table:
     if rated:
         note += (
             "MAC, EMAC and MPC near 1: a mode the data support (steady decay, the same over the whole "
-            f"response, one phase for all sensors); below {TRUSTED} look at it twice. MSV: its share in "
-            "the response."
+            f"response, one phase for all sensors); below {TRUSTED} look at it twice. EMAC compares the end of "
+            "the impulse response with its start: it is low, without harm, for a mode that has died out by then. "
+            "MSV: the share in the response."
         )
     return Table(header + (("MAC", "EMAC", "MPC", "MSV") if rated else ()), rows, "Modes", note)
 

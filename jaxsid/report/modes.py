@@ -128,7 +128,9 @@ def connecting(found: Identification, which: str, between: tuple[str, str]) -> t
     values = np.asarray(getattr(found.matrices, which))
     rows = [found.nominal.bodies.index(end) for end in between if end != GROUND]
     if len(rows) == 1:
-        return float(values[rows[0]].sum()), float("nan")
+        row = values[rows[0]]
+        total = float(row.sum())
+        return total if abs(total) > 1e-9 * np.abs(row).sum() else 0.0, float("nan")
     i, j = rows
     deviation = found.matrices_std
     std = float("nan") if deviation is None else float(np.asarray(getattr(deviation, which))[i, j])

@@ -41,6 +41,7 @@ def frequency_figure(found: Identification, output: str, column: int = 0, record
     mark_modes(axes[:, 0], found, low, high)
     frequency_scale(size, low, high)
     log_scale(size, "y")
+    _limit(size, fit, row, column, inside)
     kind = sensor_kinds(found.nominal, (output,))[0]
     label(size, y=units_of(found.nominal).label(f"{kind} per force"))
     label(phase, y="phase (°)")
@@ -85,6 +86,15 @@ def _curves(fit: FrequencyFit, row: int, column: int) -> list:
         (fit.matrices, {"color": ORANGE, "linewidth": 1.1, "linestyle": (0, (4, 2)), "label": "matrices"}),
     ]
     return [(np.asarray(values)[:, row, column], look) for values, look in looks if values is not None]
+
+
+def _limit(ax: Axes, fit: FrequencyFit, row: int, column: int, inside: np.ndarray) -> None:
+    """A decade below the model, half a decade above all; measured noise further down is cut."""
+    model = np.abs(np.asarray(fit.realization)[inside, row, column])
+    measured = np.abs(np.asarray(fit.measured)[inside, row, column])
+    low, high = model[model > 0].min(initial=np.inf), np.nanmax(np.append(measured, model), initial=0.0)
+    if 0 < low < high:
+        ax.set_ylim(0.1 * low, 3 * high)
 
 
 def _phase(ax: Axes, f: np.ndarray, curve: np.ndarray, look: dict) -> None:
