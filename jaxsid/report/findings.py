@@ -78,9 +78,9 @@ def modes_table(found: Identification) -> Table:
     if rated:
         note += (
             "MAC, EMAC and MPC near 1: a mode the data support (steady decay, the same over the whole "
-            f"response, one phase for all sensors); below {TRUSTED} look at it twice. EMAC compares the end of "
-            "the impulse response with its start: it is low, without harm, for a mode that has died out by then. "
-            "MSV: the share in the response."
+            f"response, one phase for all sensors); below {TRUSTED} look at it twice. EMAC compares the "
+            "end of the impulse response with its start: it is low, without harm, for a mode that has "
+            "died out by then. MSV: the share in the response."
         )
     return Table(header + (("MAC", "EMAC", "MPC", "MSV") if rated else ()), rows, "Modes", note)
 

@@ -89,12 +89,12 @@ def _curves(fit: FrequencyFit, row: int, column: int) -> list:
 
 
 def _limit(ax: Axes, fit: FrequencyFit, row: int, column: int, inside: np.ndarray) -> None:
-    """A decade below the model, half a decade above all; measured noise further down is cut."""
+    """Half a decade below the model and above all; measured noise further down is cut."""
     model = np.abs(np.asarray(fit.realization)[inside, row, column])
     measured = np.abs(np.asarray(fit.measured)[inside, row, column])
     low, high = model[model > 0].min(initial=np.inf), np.nanmax(np.append(measured, model), initial=0.0)
     if 0 < low < high:
-        ax.set_ylim(0.1 * low, 3 * high)
+        ax.set_ylim(low / 3, 3 * high)
 
 
 def _phase(ax: Axes, f: np.ndarray, curve: np.ndarray, look: dict) -> None:
