@@ -43,7 +43,7 @@ def noisy_tone(matrices):
     return noisy(record, 0.01, np.random.default_rng(0)), markov(matrices, DT, 4096)[1:-1, :1, :1]
 
 
-@pytest.mark.parametrize(("matrices", "least"), [(ONE, 50), (CHAIN, 50)], ids=["1 DOF", "3 DOF"])
+@pytest.mark.parametrize(("matrices", "least"), [(ONE, 1000), (CHAIN, 1000)], ids=["1 DOF", "3 DOF"])
 def test_with_noise_the_plain_estimate_is_useless(matrices, least):
     """1 % noise becomes more than `least` times the response after the feedthrough."""
     record, truth = noisy_tone(matrices)
@@ -62,7 +62,6 @@ def test_a_tone_without_its_start_is_not_enough():
     """The steady state of a tone determines two numbers only; estimators then cannot know the response."""
     record = one_at_a_time(CHAIN, 0.05, np.sin(2 * np.pi * 0.05 * np.arange(6000)))[0]
     steady = Record(record.u[4000:, :1], record.y[4000:, :1], 0.05)
-    truth = markov(CHAIN, 0.05, 300)[1:, :1, :1]
+    truth = markov(CHAIN, 0.05, 300)[1:, :, :1]
     h = Direct(history="unknown", taps=600)([steady], samples=300).h[1:]
-    truth = truth.reshape(h.shape) if truth.shape == h.shape else np.asarray(truth)
     assert error(h, truth) > 0.3

@@ -116,8 +116,8 @@ def test_dropping_is_the_same_for_an_unnormalized_transform():
 
 
 def test_averaging_reduces_the_error():
-    truth = markov(CHAIN, 0.1, 400)[:, :, :2]
-    errors = [error(WaveletEnsemble(taps=256)(ensemble(n)).h, truth) for n in (3, 12)]
+    truth = markov(CHAIN, 0.1, 129)[:, :, :2]
+    errors = [error(WaveletEnsemble(taps=128)(ensemble(n)).h, truth) for n in (3, 12)]
     assert errors[1] < errors[0] / 1.5
 
 
