@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from jaxsid.impulse.direct import Direct
 from jaxsid.impulse.ensemble import WaveletEnsemble
 from jaxsid.impulse.fourier import Fourier
-from jaxsid.impulse.protocol import ImpulseMethod, as_records
+from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.impulse.wavelet import Wavelet
 from jaxsid.records import ImpulseResponse, Record
 
@@ -29,4 +29,4 @@ def impulse_response(
 
     Raises InputError where the records cannot be used together or an option does not fit them.
     """
-    return method(as_records(records), samples)
+    return method((records,) if isinstance(records, Record) else tuple(records), samples)
