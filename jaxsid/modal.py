@@ -148,11 +148,12 @@ def _modal(rz: Realization) -> ModalModel:
     order = _order(poles)
     step, vectors, poles = step[order], vectors[:, order], poles[order]
     shapes = rz.C @ vectors
-    held = jnp.linalg.solve(vectors, rz.B.astype(vectors.dtype))
+    inverse = jnp.linalg.inv(vectors)
+    held = inverse @ rz.B
     rows, through = zip(*(_released(hold, poles, step, rz.dt) for hold in rz.hold), strict=True)
     rows, through = (jnp.stack(x, axis=1) * held for x in (rows, through))
     known = rz.observability is not None and rz.controllability is not None
-    indicators = mode_indicators(rz, 1 + step, vectors) if known else None
+    indicators = mode_indicators(rz, 1 + step, vectors, inverse) if known else None
     return _form(poles, shapes, rows, rz.D - (shapes @ through).real, indicators)
 
 

@@ -11,6 +11,7 @@ def mode_indicators(
     realization: Realization,
     eigenvalues: Complex[Array, " n"],
     eigenvectors: Complex[Array, "n n"],
+    inverse: Complex[Array, "n n"],
 ) -> Indicators:
     """The accuracy indicators of the modes (lambda_i, psi_i) of A, against the factors they came from.
 
@@ -25,6 +26,7 @@ def mode_indicators(
         realization: with its observability and controllability factors.
         eigenvalues: of A, (n,).
         eigenvectors: of A, (n, n).
+        inverse: of the eigenvectors.
 
     Source: Juang and Pappa 1985; Pappa, Elliott and Schenk, J. Guidance, Control and Dynamics 16, 1993.
     """
@@ -34,8 +36,8 @@ def mode_indicators(
     lam_w = (lam - rz.pole) / (1 - rz.pole * lam)
     shapes = rz.C @ psi
     outputs = _blocks((rz.observability @ psi).T, len(rz.row_steps))
-    inputs = _blocks(jnp.linalg.solve(psi, rz.controllability.astype(psi.dtype)), len(rz.column_steps))
-    b = jnp.linalg.solve(psi, rz.B.astype(psi.dtype))
+    inputs = _blocks(inverse @ rz.controllability, len(rz.column_steps))
+    b = inverse @ rz.B
     emac_outputs = _consistency(outputs, lam_w, rz.row_steps)
     emac = emac_outputs * _consistency(inputs, lam_w, rz.column_steps)
     mpc = phase_collinearity(shapes)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsid.realization.hankel import DenseOperator
+from jaxsid.realization.lapack import qr, svd
 
 RESTARTS = 60
 OVERSAMPLING = 10
@@ -23,6 +24,7 @@ OVERSAMPLING = 10
 RESIDUAL = 30.0
 CG_STEPS = 300
 ROUGH_RESTARTS = 2
+BLOCK_ELEMENTS = 4096  # of a block of rows in a QR factorization
 
 
 class LinearOperator(Protocol):
@@ -69,7 +71,7 @@ def dominant_subspace(operator: LinearOperator, order: int, full: bool) -> Subsp
     """
     if full:
         assert isinstance(operator, DenseOperator)
-        u, s, vt = jnp.linalg.svd(operator.matrix, full_matrices=False)
+        u, s, vt = svd(operator.matrix)
         return Subspace(u[:, :order], vt[:order].T, s)
     width = block_width(operator.shape, order)
     return _iterate(operator, order, width, RESTARTS)
@@ -135,8 +137,21 @@ def _conjugate_gradients(product: Callable[[Array], Array], b: Array) -> Array:
     return jax.lax.while_loop(unfinished, step, (jnp.zeros_like(b), b, b, jnp.vdot(b, b), 0))[0]
 
 
+def _tall_qr(x: Array) -> tuple[Array, Array]:
+    """QR of a tall matrix by blocks of rows: small factorizations need no threads waiting for each other."""
+    rows, width = x.shape
+    block = max(2 * width, BLOCK_ELEMENTS // width)
+    count = -(-rows // block)
+    if count < 3:
+        return qr(x)
+    blocks = jnp.pad(x, ((0, count * block - rows), (0, 0))).reshape(count, block, width)
+    q, r = jax.vmap(qr)(blocks)
+    top, r = _tall_qr(r.reshape(count * width, width))
+    return (q @ top.reshape(count, width, width)).reshape(-1, width)[:rows], r
+
+
 def _orthonormal(x: Array) -> Array:
-    return jnp.linalg.qr(x)[0]
+    return _tall_qr(x)[0]
 
 
 def _orthonormal_against(basis: Array, x: Array) -> Array:
@@ -148,8 +163,8 @@ def _orthonormal_against(basis: Array, x: Array) -> Array:
 
 def _triplets(basis: Array, products: Array, width: int) -> tuple[Array, Array, Array]:
     """Leading singular triplets of Q (H' Q)' from an orthonormal Q and H' Q."""
-    z, t = jnp.linalg.qr(products)
-    a, s, bt = jnp.linalg.svd(t.T, full_matrices=False)
+    z, t = _tall_qr(products)
+    a, s, bt = svd(t.T)
     return basis @ a[:, :width], s[:width], z @ bt[:width].T
 
 
@@ -180,7 +195,7 @@ def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
 def _iterate(operator: LinearOperator, order: int, width: int, restarts: int) -> Subspace:
     cols = operator.shape[1]
     dtype = jax.eval_shape(operator.mv, jax.ShapeDtypeStruct((cols, 1), jnp.result_type(float))).dtype
-    start = jax.random.normal(jax.random.key(0), (cols, width), dtype)
+    start = jax.random.uniform(jax.random.key(0), (cols, width), dtype, -1.0, 1.0)
     basis = _orthonormal(operator.mv(start))
     left, values, right = _triplets(basis, operator.rmv(basis), width)
     state = _State(left, values, right, operator.mv(right), jnp.array(0))

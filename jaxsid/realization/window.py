@@ -2,6 +2,8 @@
 
 from itertools import pairwise
 
+import numpy as np
+
 from jaxsid.checks import is_concrete, require, require_finite
 from jaxsid.records import ImpulseResponse
 
@@ -41,7 +43,8 @@ def check_response(ir: ImpulseResponse) -> None:
     require_finite(ir.h, "impulse response")
     if is_concrete(ir.h):
         require(
-            bool(ir.h[1:].any()), "the impulse response is zero after Y_0: there are no dynamics to realize"
+            bool(np.asarray(ir.h)[1:].any()),
+            "the impulse response is zero after Y_0: there are no dynamics to realize",
         )
 
 
