@@ -4,43 +4,50 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxsid.checks import InputError, InsufficientDataError, JaxsidError
-    from jaxsid.files.model_toml import read_model, write_model
-    from jaxsid.files.record_file import read_record, read_records
-    from jaxsid.identification import Identification
-    from jaxsid.pipeline.identify import identify
-    from jaxsid.impulse.direct import Direct
-    from jaxsid.impulse.ensemble import WaveletEnsemble
-    from jaxsid.impulse.estimate import impulse_response
-    from jaxsid.impulse.fourier import Fourier
-    from jaxsid.impulse.inband import InBand
-    from jaxsid.impulse.select import select_method
-    from jaxsid.impulse.spectra import coherence, frequency_response
-    from jaxsid.impulse.wavelet import Wavelet
-    from jaxsid.mechanics.first_order import (
-        modal_displacement_momentum,
-        modal_displacement_velocity,
-        physical_displacement_momentum,
-        physical_displacement_velocity,
-    )
-    from jaxsid.mechanics.hold import continuous, discretise
-    from jaxsid.mechanics.lumped import LumpedModel, lumped_model, second_order
-    from jaxsid.mechanics.pencil import complex_modes
-    from jaxsid.mechanics.simulate import markov_parameters, simulate, simulate_linear
-    from jaxsid.modal import modal, modal_realization
-    from jaxsid.physical.cbsi import cbsi
-    from jaxsid.realization.era import era
-    from jaxsid.realization.era_dc import era_dc
-    from jaxsid.realization.order import select_order
-    from jaxsid.realization.stabilization import stabilization
-    from jaxsid.records import (
-        ContinuousModel,
-        ImpulseResponse,
-        ModalModel,
-        Realization,
-        Record,
-        SecondOrderModel,
-    )
+    from jaxsid.checks import InputError as InputError
+    from jaxsid.checks import InsufficientDataError as InsufficientDataError
+    from jaxsid.checks import JaxsidError as JaxsidError
+    from jaxsid.files.model_toml import read_model as read_model
+    from jaxsid.files.model_toml import write_model as write_model
+    from jaxsid.files.record_file import read_record as read_record
+    from jaxsid.files.record_file import read_records as read_records
+    from jaxsid.identification import Identification as Identification
+    from jaxsid.impulse.direct import Direct as Direct
+    from jaxsid.impulse.ensemble import WaveletEnsemble as WaveletEnsemble
+    from jaxsid.impulse.estimate import impulse_response as impulse_response
+    from jaxsid.impulse.fourier import Fourier as Fourier
+    from jaxsid.impulse.inband import InBand as InBand
+    from jaxsid.impulse.select import select_method as select_method
+    from jaxsid.impulse.spectra import coherence as coherence
+    from jaxsid.impulse.spectra import frequency_response as frequency_response
+    from jaxsid.impulse.wavelet import Wavelet as Wavelet
+    from jaxsid.mechanics.first_order import modal_displacement_momentum as modal_displacement_momentum
+    from jaxsid.mechanics.first_order import modal_displacement_velocity as modal_displacement_velocity
+    from jaxsid.mechanics.first_order import physical_displacement_momentum as physical_displacement_momentum
+    from jaxsid.mechanics.first_order import physical_displacement_velocity as physical_displacement_velocity
+    from jaxsid.mechanics.hold import continuous as continuous
+    from jaxsid.mechanics.hold import discretise as discretise
+    from jaxsid.mechanics.lumped import LumpedModel as LumpedModel
+    from jaxsid.mechanics.lumped import lumped_model as lumped_model
+    from jaxsid.mechanics.lumped import second_order as second_order
+    from jaxsid.mechanics.pencil import complex_modes as complex_modes
+    from jaxsid.mechanics.simulate import markov_parameters as markov_parameters
+    from jaxsid.mechanics.simulate import simulate as simulate
+    from jaxsid.mechanics.simulate import simulate_linear as simulate_linear
+    from jaxsid.modes import modal as modal
+    from jaxsid.modes import modal_realization as modal_realization
+    from jaxsid.physical.cbsi import cbsi as cbsi
+    from jaxsid.pipeline.identify import identify as identify
+    from jaxsid.realization.era import era as era
+    from jaxsid.realization.era_dc import era_dc as era_dc
+    from jaxsid.realization.order import select_order as select_order
+    from jaxsid.realization.stabilization import stabilization as stabilization
+    from jaxsid.records import ContinuousModel as ContinuousModel
+    from jaxsid.records import ImpulseResponse as ImpulseResponse
+    from jaxsid.records import ModalModel as ModalModel
+    from jaxsid.records import Realization as Realization
+    from jaxsid.records import Record as Record
+    from jaxsid.records import SecondOrderModel as SecondOrderModel
 
 # Where each public name lives. Names are imported when first used, so that `import jaxsid` stays light.
 _HOMES = {
@@ -67,7 +74,7 @@ _HOMES = {
     "jaxsid.mechanics.lumped": ("LumpedModel", "lumped_model", "second_order"),
     "jaxsid.mechanics.pencil": ("complex_modes",),
     "jaxsid.mechanics.simulate": ("markov_parameters", "simulate", "simulate_linear"),
-    "jaxsid.modal": ("modal", "modal_realization"),
+    "jaxsid.modes": ("modal", "modal_realization"),
     "jaxsid.physical.cbsi": ("cbsi",),
     "jaxsid.realization.era": ("era",),
     "jaxsid.realization.era_dc": ("era_dc",),

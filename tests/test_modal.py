@@ -8,7 +8,7 @@ from reference_markov import CHAIN, OVERDAMPED, impulse_samples, markov, pole_er
 
 from jaxsid.checks import InputError
 from jaxsid.mechanics.hold import continuous, discretise
-from jaxsid.modal import modal, modal_realization
+from jaxsid.modes import modal, modal_realization
 from jaxsid.realization.era import era
 from jaxsid.realization.indicators import phase_collinearity
 from jaxsid.realization.stabilization import stabilization

@@ -74,7 +74,9 @@ def observer_response(lines: Lines, *, samples: int = 200, lags: int | None = No
         largest = _largest_lags(lines, outputs, lags)
         h[:, outputs], noise[outputs], order = _observer(lines, jnp.asarray(outputs), pole, largest, samples)
         orders.append(int(order))
-    words = f"in-band observer, {float(lines.band[0]):.3g} to {float(lines.band[1]):.3g} Hz, {max(orders)} lags"
+    words = (
+        f"in-band observer, {float(lines.band[0]):.3g} to {float(lines.band[1]):.3g} Hz, {max(orders)} lags"
+    )
     return ImpulseResponse(
         h, lines.dt, pole=pole, noise_std=noise, band=lines.band, hold=lines.hold, method=words
     )
@@ -124,7 +126,10 @@ def _observer(
     order, residual = _akaike(projected, target, 2 * weight.sum(), first, width, largest)
     inside = jnp.arange(design.shape[1]) < first + order * width
     triangle = jnp.where(inside[:, None] & inside, triangle, jnp.eye(len(triangle)))
-    x = jax.scipy.linalg.solve_triangular(triangle, jnp.where(inside[:, None], projected, 0.0)) / scale[:, None]
+    x = (
+        jax.scipy.linalg.solve_triangular(triangle, jnp.where(inside[:, None], projected, 0.0))
+        / scale[:, None]
+    )
     lagged = x[first:].reshape(largest, width, m)
     a = jnp.swapaxes(lagged[:, first:], 1, 2)
     b = jnp.swapaxes(jnp.concatenate([x[None, :r], lagged[:, :r]]), 1, 2)

@@ -96,7 +96,10 @@ def _smoothed_power(record: Record, grid: np.ndarray) -> np.ndarray:
 
 
 def record_lines(
-    records: Sequence[Record], *, outputs: Sequence[str] | None = None, band: tuple[float, float] | None = None
+    records: Sequence[Record],
+    *,
+    outputs: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
 ) -> Lines:
     """Fourier lines of the records within a band, outputs matched by name.
 
@@ -115,12 +118,18 @@ def record_lines(
             r.inputs == records[0].inputs and r.hold == records[0].hold,
             f"{r.name}: its inputs {r.inputs} or holds differ from those of {records[0].name}",
         )
-    require(len(set(records[0].hold)) == 1 or "band" not in records[0].hold, "hold 'band' cannot be mixed with others")
+    require(
+        len(set(records[0].hold)) == 1 or "band" not in records[0].hold,
+        "hold 'band' cannot be mixed with others",
+    )
     if len(records) == 1:
         check_excitation(records[0])
-    names = tuple(outputs) if outputs is not None else tuple(dict.fromkeys(n for r in records for n in r.outputs))
+    names = (
+        tuple(outputs) if outputs is not None else tuple(dict.fromkeys(n for r in records for n in r.outputs))
+    )
     require(
-        band is not None or all(is_concrete(r.u, r.dt) for r in records), "name the band when the records are traced"
+        band is not None or all(is_concrete(r.u, r.dt) for r in records),
+        "name the band when the records are traced",
     )
     band = excited_band(records) if band is None else band
     dt = float(max(records, key=lambda r: r.u.shape[0]).dt)

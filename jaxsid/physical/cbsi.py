@@ -88,16 +88,25 @@ def visible_states(bodies: int, sensors: Sequence[str], rigid: int, loose: int) 
 
 
 def _patterns(patterns: ArrayLike | None, bodies: int) -> np.ndarray:
-    return np.zeros((bodies, 0)) if patterns is None else np.asarray(patterns, dtype=float).reshape(bodies, -1)
+    return (
+        np.zeros((bodies, 0)) if patterns is None else np.asarray(patterns, dtype=float).reshape(bodies, -1)
+    )
 
 
 def _check(
-    model: ContinuousModel, kinds: tuple[str, ...], places: tuple[int, ...], solution: str, rigid: int, loose: int
+    model: ContinuousModel,
+    kinds: tuple[str, ...],
+    places: tuple[int, ...],
+    solution: str,
+    rigid: int,
+    loose: int,
 ) -> None:
     outputs, inputs, order = model.C.shape[0], model.B.shape[1], model.A.shape[0]
     require(solution in SOLUTIONS, f"solution '{solution}' is unknown; choose from {', '.join(SOLUTIONS)}.")
     for kind in kinds:
-        require(kind in SENSOR_KINDS, f"sensor kind '{kind}' is unknown; choose from {', '.join(SENSOR_KINDS)}.")
+        require(
+            kind in SENSOR_KINDS, f"sensor kind '{kind}' is unknown; choose from {', '.join(SENSOR_KINDS)}."
+        )
     require(
         len(kinds) == outputs,
         f"CBSI needs one sensor at each degree of freedom: {outputs} outputs but {len(kinds)} sensor kinds. With "
@@ -223,7 +232,9 @@ def _diagnostics(
 ) -> CbsiDiagnostics:
     """Contradictions in the realization, before any of them is averaged away."""
     # at once, a force moves no displacement and no velocity, and accelerates by M^-1 B_u
-    displaced = [(model.C @ model.B)[i] * jnp.linalg.norm(model.A) for i, k in enumerate(kinds) if k == "displacement"]
+    displaced = [
+        (model.C @ model.B)[i] * jnp.linalg.norm(model.A) for i, k in enumerate(kinds) if k == "displacement"
+    ]
     at_once = [model.D[i] - (gained[i] if k == "acceleration" else 0.0) for i, k in enumerate(kinds)]
     size = jnp.linalg.norm(gained)
     return CbsiDiagnostics(

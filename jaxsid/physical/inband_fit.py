@@ -80,9 +80,8 @@ def fit_target(
     hold = jnp.where(jnp.abs(half) > 0, jnp.sinh(half) / jnp.where(jnp.abs(half) > 0, half, 1.0), 1.0)
     factors = {"zero": hold * jnp.exp(-half), "first": hold**2, "band": jnp.ones_like(hold)}
     drive = lines.u * jnp.stack([factors[h] for h in lines.hold], axis=1)
-    sampled = _response(realization.A, realization.B, realization.C, realization.D, lines.z)
-    smooth = _response(model.A, model.B, model.C, model.D, s)
-    excess = jnp.einsum("kor,kr->ko", sampled, lines.u) - jnp.einsum("kor,kr->ko", smooth, drive)
+    sampled = _modal_response(realization, lines.z, lines.u)
+    excess = sampled - _modal_response(model, s, drive)
     poles = jnp.linalg.eigvals(realization.A)
     weight = lines.weight * jnp.sqrt(2.0) / noise
     parts = 1 / (lines.z[:, None] - poles)
@@ -90,8 +89,9 @@ def fit_target(
     mirrored = 1 / (lines.z[:, None] - poles.conj())
     basis = jnp.concatenate([parts + mirrored, 1j * (parts - mirrored), jnp.ones((len(s), 1))], axis=1)
     basis = (basis[:, :, None] * lines.record[:, None, :]).reshape(len(s), -1)
-    transient = jax.vmap(lambda w: _orthonormal(basis * w[:, None]), in_axes=1, out_axes=2)(weight)
-    return Target(s, drive, lines.y - excess, weight, transient)
+    # one output after another: batched factorizations side by side can lock up the CPU's thread pool
+    transient = jax.lax.map(lambda w: _orthonormal(basis * w[:, None]), weight.T)
+    return Target(s, drive, lines.y - excess, weight, jnp.moveaxis(transient, 0, 2))
 
 
 def _orthonormal(x: Array) -> Array:
@@ -101,9 +101,11 @@ def _orthonormal(x: Array) -> Array:
     return u * (sv > 1e-10 * sv[0])
 
 
-def _response(A: Array, B: Array, C: Array, D: Array, points: Array) -> Array:
-    resolvent = jnp.linalg.solve(points[:, None, None] * jnp.eye(len(A)) - A, B.astype(points.dtype))
-    return C @ resolvent + D
+def _modal_response(model: Realization | ContinuousModel, points: Array, u: Array) -> Array:
+    """(C (x I - A)^-1 B + D) u at many points x, through the eigenvectors of A."""
+    values, vectors = jnp.linalg.eig(model.A)
+    driven = u @ jnp.linalg.solve(vectors, model.B.astype(vectors.dtype)).T
+    return (driven / (points[:, None] - values)) @ (model.C @ vectors).T + u @ model.D.T
 
 
 @eqx.filter_jit

@@ -51,7 +51,8 @@ def symmetric_positive(
     def matrices(x: Array) -> tuple[Array, Array, Array]:
         parts = jnp.split(x, ends[:-1])
         m, d, k = (
-            jnp.zeros_like(f).at[i].set(p) * s for f, i, p, s in zip(factors, lower, parts, sizes, strict=True)
+            jnp.zeros_like(f).at[i].set(p) * s
+            for f, i, p, s in zip(factors, lower, parts, sizes, strict=True)
         )
         return m @ m.T, damper @ d @ d.T @ damper.T, spring @ k @ k.T @ spring.T
 

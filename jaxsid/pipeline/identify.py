@@ -74,7 +74,9 @@ def identify(
         records, lines, order=order, expected=system.visible, realization=realization, method=method
     )
     say("mass, damping and stiffness")
-    found = find_matrices(model, system, space) if len(space.raw.A) == system.visible else _not_this_order(system)
+    found = (
+        find_matrices(model, system, space) if len(space.raw.A) == system.visible else _not_this_order(system)
+    )
     explained = found.fit is not None and float(found.fit.misfit) < POOR
     say("modes, stabilization, fit")
     final = final_modes(space, found.model if explained else None, found.fit if explained else None)
@@ -105,7 +107,12 @@ def identify(
         frequency_fit=frequency_fits(
             records, system.outputs, final.continuous, found.model, [float(f) for f in lines.band]
         ),
-        warnings=(*_about_records(records, lines), *space.warnings, *found.warnings, *_missing(model, system)),
+        warnings=(
+            *_about_records(records, lines),
+            *space.warnings,
+            *found.warnings,
+            *_missing(model, system),
+        ),
     )
 
 

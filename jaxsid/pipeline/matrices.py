@@ -94,7 +94,9 @@ def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, 
     except JaxsidError as trouble:
         return None, (f"CBSI was left out: {trouble}",)
     if not all(bool(jnp.isfinite(x).all()) for x in (found.mass, found.damping, found.stiffness)):
-        return None, ("CBSI found no scale for a mode that the inputs hardly drive; the fit to the lines goes on.",)
+        return None, (
+            "CBSI found no scale for a mode that the inputs hardly drive; the fit to the lines goes on.",
+        )
     return found, ()
 
 
@@ -175,7 +177,11 @@ def _positive(matrices: Triple) -> bool:
 
 def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[str, ...]:
     notes = []
-    if structured is not None and structured.diagnostics is not None and structured.diagnostics.negative_scales > 0:
+    if (
+        structured is not None
+        and structured.diagnostics is not None
+        and structured.diagnostics.negative_scales > 0
+    ):
         notes.append(
             f"CBSI met {int(structured.diagnostics.negative_scales)} mode(s) with a negative scale: shape and driving "
             "point contradict each other. Check polarity, place and gain of sensors and inputs."

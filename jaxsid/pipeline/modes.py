@@ -12,11 +12,18 @@ from jaxsid.impulse.lines import laguerre_pole
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import continuous, discretise, shift_to_laguerre
 from jaxsid.mechanics.recursion import markov
-from jaxsid.modal import modal
+from jaxsid.modes import modal
 from jaxsid.physical.inband_fit import MatrixFit
 from jaxsid.pipeline.state_space import StateSpace
 from jaxsid.realization.era import era
-from jaxsid.records import ContinuousModel, ImpulseResponse, Indicators, ModalModel, Realization, SecondOrderModel
+from jaxsid.records import (
+    ContinuousModel,
+    ImpulseResponse,
+    Indicators,
+    ModalModel,
+    Realization,
+    SecondOrderModel,
+)
 
 WINDOW = 100  # block rows and columns of the realization of a model's own response
 
@@ -54,7 +61,10 @@ def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: Matri
         slopes = _slopes_of_denominators(space, np.asarray(own.poles))
         covariance = np.asarray(space.polished.pole_covariance)
     else:
-        slopes, covariance = _slopes_of_matrices(matrices, fit, np.asarray(own.poles)), np.asarray(fit.covariance)
+        slopes, covariance = (
+            _slopes_of_matrices(matrices, fit, np.asarray(own.poles)),
+            np.asarray(fit.covariance),
+        )
     frequency, ratio = _deviations(np.asarray(own.poles), slopes, covariance)
     return FinalModes(realization, model, own, jnp.asarray(frequency), jnp.asarray(ratio))
 
@@ -108,7 +118,11 @@ def _slopes_of_denominators(space: StateSpace, poles: np.ndarray) -> np.ndarray:
     misfit = np.concatenate([misfit, np.abs(w[:, None] + theta[2 * pairs :])], axis=1)
     # z from w, then s from z
     dz = (1 - a**2) / (1 + a * w) ** 2
-    ds = dz / (z * float(space.lines.dt)) if space.lines.hold[0] != "band" else dz * (1 - half) ** 2 / float(space.lines.dt)
+    ds = (
+        dz / (z * float(space.lines.dt))
+        if space.lines.hold[0] != "band"
+        else dz * (1 - half) ** 2 / float(space.lines.dt)
+    )
     slopes = np.zeros((len(poles), len(theta)), complex)
     for i, section in enumerate(misfit.argmin(axis=1)):
         if section < pairs:
@@ -119,7 +133,9 @@ def _slopes_of_denominators(space: StateSpace, poles: np.ndarray) -> np.ndarray:
     return slopes
 
 
-def _deviations(poles: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _deviations(
+    poles: np.ndarray, slopes: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations of abs(s) and -real(s) / abs(s)."""
     size = np.maximum(np.abs(poles), np.finfo(float).tiny)
     frequency = (slopes * poles.conj()[:, None]).real / size[:, None]

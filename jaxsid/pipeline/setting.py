@@ -52,7 +52,9 @@ def setting(model: LumpedModel, records: Sequence[Record]) -> Setting:
             if name not in known:
                 bad_input(f"{r.name}: output '{name}' is no sensor of the model ({', '.join(known)}).")
         if set(r.inputs) != {i.name for i in model.inputs}:
-            bad_input(f"{r.name}: inputs {r.inputs} are not those of the model: {[i.name for i in model.inputs]}.")
+            bad_input(
+                f"{r.name}: inputs {r.inputs} are not those of the model: {[i.name for i in model.inputs]}."
+            )
     measured = {name for r in records for name in r.outputs}
     sensors = [s for s in model.sensors if s.name in measured]
     bodies = list(model.bodies)
@@ -65,10 +67,11 @@ def setting(model: LumpedModel, records: Sequence[Record]) -> Setting:
         outputs=tuple(s.name for s in sensors),
         kinds=kinds,
         places=places,
-        one_a_body=tuple(places.index(b) for b in range(len(bodies))) if set(places) >= set(range(len(bodies))) else None,
+        one_a_body=tuple(places.index(b) for b in range(len(bodies)))
+        if set(places) >= set(range(len(bodies)))
+        else None,
         collocated=tuple(bodies.index(i.body) for i in model.inputs),
         rigid=rigid,
         loose=loose,
         visible=visible_states(len(bodies), kinds, rigid.shape[1], loose.shape[1]),
     )
-

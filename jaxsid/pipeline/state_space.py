@@ -67,7 +67,9 @@ def state_space(
         InputError: an unknown realization, an order that does not fit the data.
         InsufficientDataError: no stable fit of that order.
     """
-    require(realization in ("era", "era_dc"), f"realization '{realization}' is unknown; choose era or era_dc.")
+    require(
+        realization in ("era", "era_dc"), f"realization '{realization}' is unknown; choose era or era_dc."
+    )
     response = observer_response(lines) if method is None else method(records, None)
     order_used = expected if order is None else order
     raw = _realize(response, order_used, realization)
@@ -82,7 +84,13 @@ def state_space(
         lines = _common_rate(lines, polished.realization)
         polished = polish(polished.realization, lines)
     return StateSpace(
-        response, raw, polished, continuous(polished.realization), lines, reason, _warnings(polished.realization)
+        response,
+        raw,
+        polished,
+        continuous(polished.realization),
+        lines,
+        reason,
+        _warnings(polished.realization),
     )
 
 
@@ -91,7 +99,9 @@ def _realize(response: ImpulseResponse, order: int, realization: str) -> Realiza
     if realization == "era":
         return era(response, order=order, rows=half, cols=half)
     reach = response.h.shape[0] - 2 - 2 * (LAGS - 1)
-    return era_dc(response, order=order, rows=reach // 3, cols=reach - reach // 3 - LAGS, lags=LAGS, first_lag=1)
+    return era_dc(
+        response, order=order, rows=reach // 3, cols=reach - reach // 3 - LAGS, lags=LAGS, first_lag=1
+    )
 
 
 def _reason(raw: Realization, order: int | None, expected: int) -> str:
@@ -111,7 +121,9 @@ def _warnings(found: Realization) -> tuple[str, ...]:
     growing = np.abs(np.linalg.eigvals(np.asarray(found.A))).max()
     slack = 1e-6
     if growing > 1 + slack:
-        return (f"A pole is unstable (abs(z) = {growing:.6g}): a free body, active feedback, or too high an order.",)
+        return (
+            f"A pole is unstable (abs(z) = {growing:.6g}): a free body, active feedback, or too high an order.",
+        )
     return ()
 
 

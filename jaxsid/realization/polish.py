@@ -114,8 +114,9 @@ def _projected_residual(theta: Array, args: tuple[Lines, Array, Array]) -> Array
         left = _weighted(y - design @ coefficients, weight)
         return left - q @ (q.T @ left)
 
+    # one output after another: batched factorizations side by side can lock up the CPU's thread pool
     weight = lines.weight * jnp.sqrt(2.0) / noise
-    return jax.vmap(one_output, in_axes=1)(lines.y, weight)
+    return jax.lax.map(lambda pair: one_output(*pair), (lines.y.T, weight.T))
 
 
 def _solve(design: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
@@ -139,7 +140,7 @@ def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, 
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
     design = _design(theta, lines, pole)
     weight = lines.weight / noise
-    response = jax.vmap(lambda y, v: _solve(design, y, v)[2], in_axes=1, out_axes=1)(lines.y, weight)
+    response = jax.lax.map(lambda pair: _solve(design, *pair)[2], (lines.y.T, weight.T)).T
     residual = (lines.y - design @ response) * lines.weight
     inputs, records = lines.u.shape[1], lines.record.shape[1]
     response = response.reshape(-1, inputs + records, lines.y.shape[1])

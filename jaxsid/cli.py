@@ -1,0 +1,231 @@
+"""The command `jaxsid`. Progress goes to standard error; exit code 0 done, 2 bad input, 3 no answer in the data."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX loads: cached programs log needless warnings
+
+from jaxsid.checks import InsufficientDataError, JaxsidError
+
+app = typer.Typer(
+    help="From measured records of a mechanical system to its modes and its mass, damping and stiffness.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,
+)
+
+
+class Method(StrEnum):
+    """Estimators of the impulse response."""
+
+    inband = "inband"
+    fourier = "fourier"
+    direct = "direct"
+    wavelet = "wavelet"
+    auto = "auto"
+
+
+class Algorithm(StrEnum):
+    """Realization algorithms."""
+
+    era = "era"
+    era_dc = "era_dc"
+
+
+class Initial(StrEnum):
+    """Initial state of a record."""
+
+    estimate = "estimate"
+    rest = "rest"
+
+
+ModelFile = Annotated[Path, typer.Argument(help="Model file (TOML): bodies, connections, inputs, sensors.")]
+RecordFiles = Annotated[
+    list[Path],
+    typer.Argument(help="Records: CSV, NPZ, MAT, UFF 58, or a TOML list of records.", metavar="RECORD..."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")]
+
+
+@app.command()
+def identify(
+    model: ModelFile,
+    records: RecordFiles,
+    out: Annotated[Path, typer.Option(help="Folder for identification.json, model.toml and report.html.")],
+    order: Annotated[
+        int | None, typer.Option(help="Number of states; default: what bodies and sensors promise.")
+    ] = None,
+    band: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Lowest and highest frequency to use, Hz; default: found."),
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="Impulse-response estimator; auto compares on held-out samples.")
+    ] = Method.inband,
+    realization: Annotated[Algorithm, typer.Option(help="Realization algorithm.")] = Algorithm.era,
+    initial: Annotated[Initial, typer.Option(help="Initial state of each record.")] = Initial.estimate,
+    quiet: Quiet = False,
+) -> None:
+    """Impulse response, ERA or ERA/DC, modes, mass, damping and stiffness from records."""
+    with _errors(), _progress(quiet) as say:
+        say("loading")
+        _numerics()
+        from jaxsid.files.model_toml import read_model
+        from jaxsid.files.record_file import read_records
+        from jaxsid.pipeline.identify import identify as run
+
+        nominal = read_model(model)
+        measured = read_records(records, nominal)
+        found = run(
+            nominal,
+            measured,
+            order=order,
+            band=band,
+            method=_method(method, measured, say),
+            realization=realization.value,
+            initial=initial.value,
+            progress=say,
+        )
+        _write(found, out, say)
+    if not quiet:
+        _summary(found, out)
+
+
+@app.command()
+def simulate(
+    model: ModelFile,
+    record: Annotated[
+        Path, typer.Argument(help="Record with the inputs: CSV, NPZ, MAT, UFF 58, or a TOML list.")
+    ],
+    out: Annotated[Path, typer.Option(help="CSV file to write: time and one column for each sensor.")],
+    initial: Annotated[
+        Initial, typer.Option(help="Initial state; estimate fits it to the sensors.")
+    ] = Initial.rest,
+    quiet: Quiet = False,
+) -> None:
+    """The model's response to a record's inputs."""
+    with _errors(), _progress(quiet) as say:
+        say("loading")
+        _numerics()
+        from jaxsid.files.csv_out import write_response
+        from jaxsid.files.model_toml import read_model
+        from jaxsid.files.record_file import read_record
+        from jaxsid.mechanics.simulate import simulate as run
+
+        lumped = read_model(model)
+        measured = read_record(record, lumped)
+        say("simulating")
+        y = run(lumped, measured, initial=initial.value)
+        write_response(out, y, float(measured.dt), [s.name for s in lumped.sensors])
+    if not quiet:
+        typer.echo(f"{out}: {len(y)} samples of {len(lumped.sensors)} sensors", err=True)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the records, the model and the report.")] = Path(
+        "demo"
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    quiet: Quiet = False,
+) -> None:
+    """The whole story on the built-in rig: a servo motor drives discs through a gearbox."""
+    with _errors(), _progress(quiet) as say:
+        say("loading")
+        _numerics()
+        from jaxsid.demo import run_demo
+
+        found = run_demo(out, seed, say)
+        _write(found, out, say)
+    if not quiet:
+        _summary(found, out)
+
+
+def _numerics() -> None:
+    """Double precision, and compiled programs kept on disk so that the next run starts at once."""
+    import jax
+
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", os.environ.get("JAXSID_CACHE") or str(home / "jaxsid"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _method(choice: Method, records, say):
+    from jaxsid.impulse.direct import Direct
+    from jaxsid.impulse.fourier import Fourier
+    from jaxsid.impulse.select import select_method
+    from jaxsid.impulse.wavelet import Wavelet
+
+    if choice is Method.inband:
+        return None
+    if choice is Method.auto:
+        say("comparing estimators on held-out samples")
+        selection = select_method(records)
+        typer.echo(selection.reason, err=True)
+        return selection.method
+    return {Method.fourier: Fourier, Method.direct: Direct, Method.wavelet: Wavelet}[choice]()
+
+
+def _write(found, out: Path, say) -> None:
+    """All files, or none."""
+    from jaxsid.files.atomic import atomic_directory
+    from jaxsid.files.model_toml import write_model
+    from jaxsid.files.results_json import write_json
+    from jaxsid.report.html import write_report
+    from jaxsid.report.results import identification_json
+
+    say("report")
+    with atomic_directory(out) as draft:
+        write_json(draft / "identification.json", identification_json(found))
+        if found.identified is not None:
+            write_model(
+                found.identified, draft / "model.toml", header="Identified by jaxsid from measured records."
+            )
+        write_report(found, draft / "report.html")
+
+
+def _summary(found, out: Path) -> None:
+    from jaxsid.report.summary import print_summary
+
+    print_summary(found)
+    names = ["identification.json", *(["model.toml"] if found.identified is not None else []), "report.html"]
+    typer.echo(f"\nWritten to {out}: {', '.join(names)}")
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator:
+    """A line that says what is going on, on standard error; plain lines where that is no terminal."""
+    if quiet:
+        yield lambda text: None
+        return
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda text: typer.echo(f"jaxsid: {text} ...", err=True)
+        return
+    with console.status("loading") as status:
+        yield lambda text: status.update(f"{text} ... (the first run on a machine also compiles)")
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    """One clear message and the exit code for errors that are the input's."""
+    try:
+        yield
+    except JaxsidError as error:
+        typer.secho(f"jaxsid: {error}", fg="red" if sys.stderr.isatty() else None, err=True)
+        raise typer.Exit(3 if isinstance(error, InsufficientDataError) else 2) from None
+
+
+if __name__ == "__main__":
+    app()
