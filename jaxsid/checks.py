@@ -73,7 +73,8 @@ def check_record(record: Record) -> None:
     require_finite(record.u, f"{record.name}, input", record.inputs)
     require_finite(record.y, f"{record.name}, output", record.outputs)
     if is_concrete(record.dt):
-        require(float(record.dt) > 0, f"{record.name}: the sampling interval must be positive, not {float(record.dt)} s")
+        dt = float(record.dt)
+        require(dt > 0, f"{record.name}: the sampling interval must be positive, not {dt} s")
 
 
 def check_excitation(record: Record) -> None:
@@ -86,11 +87,14 @@ def check_excitation(record: Record) -> None:
     for name, column, size in zip(record.inputs, u.T, scale, strict=True):
         if size <= 1e-12 * max(np.abs(column).max() * np.sqrt(len(u)), np.finfo(float).tiny):
             state = "zero" if not column.any() else "constant"
-            bad_input(f"{record.name}: input '{name}' is {state} throughout: it excites nothing. Leave it out, or use another record.")
+            bad_input(
+                f"{record.name}: input '{name}' is {state} throughout: it excites nothing. Leave it out, or use "
+                "another record."
+            )
     coherence = np.abs((centred / scale).T @ (centred / scale))
     for i, j in zip(*np.triu_indices(u.shape[1], 1), strict=True):
         if coherence[i, j] > 1 - 1e-10:
             bad_input(
-                f"{record.name}: inputs '{record.inputs[i]}' and '{record.inputs[j]}' are the same signal up to a factor, "
-                "so their effects cannot be told apart. Drive them independently, one after another, or drop one."
+                f"{record.name}: inputs '{record.inputs[i]}' and '{record.inputs[j]}' are the same signal up to a "
+                "factor, so their effects cannot be told apart. Drive them independently, one after another, or drop one."
             )

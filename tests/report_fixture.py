@@ -12,7 +12,7 @@ from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.lumped import Connection, Input, LumpedModel, Sensor, lumped_model, second_order
 from jaxsid.mechanics.simulate import impulse_response_of
-from jaxsid.modal import modal
+from jaxsid.modes import modal
 from jaxsid.realization.era import era
 from jaxsid.realization.stabilization import stabilization
 from jaxsid.records import CbsiDiagnostics, ImpulseResponse, Record, SecondOrderModel

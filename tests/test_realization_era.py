@@ -8,7 +8,7 @@ from reference_markov import CHAIN, SYSTEMS, markov, pole_error, rebuilt
 
 from jaxsid.checks import InputError
 from jaxsid.mechanics.hold import shift_to_laguerre
-from jaxsid.modal import modal
+from jaxsid.modes import modal
 from jaxsid.realization.era import era
 from jaxsid.realization.order import select_order
 from jaxsid.records import ImpulseResponse, Realization

@@ -7,7 +7,7 @@ import pytest
 from reference_markov import CHAIN, ONE, SYSTEMS, markov, pole_error, rebuilt
 
 from jaxsid.checks import InputError
-from jaxsid.modal import modal
+from jaxsid.modes import modal
 from jaxsid.realization.era_dc import CorrelationOperator, _correlations, _operator, _Shape, era_dc
 from jaxsid.records import ImpulseResponse
 

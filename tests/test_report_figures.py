@@ -12,7 +12,7 @@ from report_fixture import chain, identification, without_matrices
 from jaxsid.checks import InputError
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Sensor, lumped_model, second_order
-from jaxsid.modal import modal
+from jaxsid.modes import modal
 from jaxsid.report import plots
 from jaxsid.report.modes import connecting, displacement_shapes, modes_of
 
