@@ -67,7 +67,8 @@ def observer_response(lines: Lines, *, samples: int = 200, lags: int | None = No
         InsufficientDataError: fewer lines than unknowns.
     """
     require(samples >= 3, f"an impulse response of {samples} samples is too short to realize anything")
-    pole = laguerre_pole(float(lines.band[1]), float(lines.dt))
+    # an array, since a plain number would make a new program for every band
+    pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
     h = np.zeros((samples, lines.y.shape[1], lines.u.shape[1]))
     noise, orders = np.zeros(lines.y.shape[1]), []
     for outputs in output_groups(lines):
@@ -104,7 +105,7 @@ def _largest_lags(lines: Lines, outputs: np.ndarray, lags: int | None) -> int:
 
 @eqx.filter_jit
 def _observer(
-    lines: Lines, outputs: Int[Array, " m"], pole: float, largest: int, samples: int
+    lines: Lines, outputs: Int[Array, " m"], pole: Array, largest: int, samples: int
 ) -> tuple[Float[Array, "samples m r"], Float[Array, " m"], Int[Array, ""]]:
     """Observer by one QR factorization that serves every order; the order by Akaike's criterion."""
     y, weight = lines.y[:, outputs], lines.weight[:, outputs].min(axis=1)

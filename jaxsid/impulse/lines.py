@@ -9,6 +9,7 @@ Source: R. Pintelon and J. Schoukens, System Identification: A Frequency Domain 
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from jaxsid.records import Record
 EXCITED = 1 / 400
 # The band is spread over this part of the circle of the Laguerre shift, so that regressions in it are well posed.
 BAND_ANGLE = 0.8 * np.pi
+Points = TypeVar("Points", Array, np.ndarray)
 
 
 class Lines(eqx.Module):
@@ -55,7 +57,7 @@ class Lines(eqx.Module):
     hold: tuple[str, ...] = eqx.field(static=True)
 
 
-def laguerre_shift(z: Array, pole: Array | float) -> Array:
+def laguerre_shift(z: Points, pole: Array | float) -> Points:
     """The Laguerre shift w = (z - a) / (1 - a z) at points z of the unit circle."""
     return (z - pole) / (1 - pole * z)
 
@@ -75,7 +77,7 @@ def excited_band(records: Sequence[Record]) -> tuple[float, float]:
     nyquist = min(0.5 / float(r.dt) for r in records)
     longest = max(r.u.shape[0] * float(r.dt) for r in records)
     grid = np.linspace(0.0, nyquist, max(16, int(nyquist * longest)) + 1)[1:]
-    power = sum(_smoothed_power(r, grid) for r in records)
+    power = np.sum([_smoothed_power(r, grid) for r in records], axis=0)
     excited = np.flatnonzero((power > EXCITED * power.max(axis=0)).all(axis=1))
     if len(excited) < 8:
         raise InsufficientDataError(

@@ -67,7 +67,8 @@ def cbsi(
     rigid, loose = _patterns(rigid, len(kinds)), _patterns(loose, len(kinds))
     _check(model, kinds, places, solution, rigid.shape[1], loose.shape[1])
     complement = np.linalg.svd(rigid)[0][:, rigid.shape[1] :]
-    return _cbsi(model, kinds, places, solution == "symmetric", rigid, complement, loose.shape[1] > 0)
+    free, held = jnp.asarray(rigid), jnp.asarray(complement)
+    return _cbsi(model, kinds, places, solution == "symmetric", free, held, loose.shape[1] > 0)
 
 
 def visible_states(bodies: int, sensors: Sequence[str], rigid: int, loose: int) -> int:
@@ -152,8 +153,9 @@ def _cbsi(
         states = spring @ displacement, damper @ velocity, acceleration
         held = complement if rigid.shape[1] else spring
         matrices = symmetric_positive(matrices, states, model.B, gained, B_u, held, held if loose else damper)
-    choose = lambda kind: jnp.diag(jnp.array([1.0 * (k == kind) for k in kinds]))  # noqa: E731
-    return SecondOrderModel(*matrices, B_u, *(choose(kind) for kind in SENSOR_KINDS), diagnostics)
+    seen = (jnp.diag(jnp.array([1.0 * (k == kind) for k in kinds])) for kind in SENSOR_KINDS)
+    displaced, moved, accelerated = seen
+    return SecondOrderModel(*matrices, B_u, displaced, moved, accelerated, diagnostics)
 
 
 def _motion(
