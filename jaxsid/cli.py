@@ -10,7 +10,9 @@ from typing import Annotated
 
 import typer
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX loads: cached programs log needless warnings
+# Before JAX and numpy load: cached programs log needless warnings, and threads slow the many small factorizations.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from jaxsid.checks import InsufficientDataError, JaxsidError
 

@@ -110,14 +110,14 @@ def _modal_response(model: Realization | ContinuousModel, points: Array, u: Arra
 
 @eqx.filter_jit
 def fit_matrices(
-    target: Target, parameterization: Parameterization, start: Array, sensed: SecondOrderModel
+    target: Target, parameterization: Parameterization, start: Triple, sensed: SecondOrderModel
 ) -> MatrixFit:
     """Unknowns of a parameterization that minimize the weighted squares of the lines' residual.
 
     Args:
         target: from `fit_target`.
         parameterization: what may vary.
-        start: unknowns to begin with.
+        start: M, D, K to begin with.
         sensed: gives the input matrix and the sensors; its matrices are not used.
     """
 
@@ -127,14 +127,14 @@ def fit_matrices(
         left = _project(target, (target.y - model)[:, None])[:, 0]
         return left.ravel(), -jnp.moveaxis(_project(target, derivative), 1, 2).reshape(-1, len(theta))
 
-    found = levenberg_marquardt(evaluate, start, max_steps=STEPS)
+    found = levenberg_marquardt(evaluate, parameterization.unknowns(start), max_steps=STEPS)
     scale = jnp.sqrt(jnp.diag(found.jacobian_product))
     covariance = jnp.linalg.inv(found.jacobian_product / scale / scale[:, None]) / scale / scale[:, None]
     slopes = jax.jacfwd(parameterization.matrices)(found.value)
     d_mass, d_damping, d_stiffness = (
         jnp.sqrt(jnp.maximum(jnp.einsum("ijp,pq,ijq->ij", x, covariance, x), 0.0)) for x in slopes
     )
-    free = (target.transient**2).sum() + len(start)
+    free = (target.transient**2).sum() + len(found.value)
     equations = 2 * (target.weight > 0).sum()
     misfit = 2 * found.cost / jnp.maximum(equations - free, 1.0)
     return MatrixFit(

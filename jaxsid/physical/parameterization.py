@@ -87,9 +87,11 @@ class PositiveMatrices(eqx.Module):
 
 
 def entry_sizes(
-    matrices: Triple, complements: tuple[Array, Array, Array], rate: Array
-) -> tuple[Array, Array, Array]:
-    """Typical size of the entries of M, D, K, from the diagonals; that of D is at least 1 % of rate * M.
+    matrices: tuple[np.ndarray, np.ndarray, np.ndarray],
+    complements: tuple[np.ndarray, np.ndarray, np.ndarray],
+    rate: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Typical size of the entries of M, D, K, from the diagonals of M, of 1 % of rate * M, and of K.
 
     Args:
         matrices: a first guess of M, D, K.
@@ -98,8 +100,8 @@ def entry_sizes(
     """
     sizes = []
     for matrix, e in zip((matrices[0], 0.01 * rate * matrices[0], matrices[2]), complements, strict=True):
-        diagonal = jnp.abs(jnp.diag(jnp.linalg.pinv(e) @ matrix @ jnp.linalg.pinv(e).T))
-        root = jnp.sqrt(jnp.maximum(diagonal, 1e-6 * diagonal.max()))
+        diagonal = np.abs(np.diag(np.linalg.pinv(e) @ matrix @ np.linalg.pinv(e).T))
+        root = np.sqrt(np.maximum(diagonal, 1e-6 * diagonal.max()))
         sizes.append(root * root[:, None])
     return sizes[0], sizes[1], sizes[2]
 

@@ -74,9 +74,10 @@ def _sensed(model: LumpedModel, system: Setting) -> SecondOrderModel:
         whole.damping,
         whole.stiffness,
         whole.input_matrix,
-        whole.displacement_sensors[rows],
-        whole.velocity_sensors[rows],
-        whole.acceleration_sensors[rows],
+        *(
+            jnp.asarray(np.asarray(h)[rows])
+            for h in (whole.displacement_sensors, whole.velocity_sensors, whole.acceleration_sensors)
+        ),
         None,
     )
 
@@ -109,15 +110,14 @@ def _best_fit(
 ) -> MatrixFit | None:
     """The fit with the smallest misfit over the starts, tried in turn until one is good."""
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
-    free = _complement(system.rigid)
-    complements = tuple(map(jnp.asarray, (np.eye(len(model.bodies)), _complement(system.loose), free)))
-    rate = jnp.asarray(_rate(space))
+    every, moving, strained = np.eye(len(model.bodies)), _complement(system.loose), _complement(system.rigid)
+    complements = every, moving, strained
     best = None
     for start in _starts(space, sensed, structured):
-        sizes = entry_sizes(start, complements, rate)
+        sizes = entry_sizes(start, complements, _rate(space))
         for kind in (SymmetricMatrices, PositiveMatrices):
             parameters = kind(sizes, complements)
-            fit = fit_matrices(target, parameters, parameters.unknowns(start), sensed)
+            fit = fit_matrices(target, parameters, start, sensed)
             if _positive(fit.matrices) and bool(jnp.isfinite(fit.misfit)):
                 best = fit if best is None or fit.misfit < best.misfit else best
                 break
@@ -138,7 +138,7 @@ def _rate(space: StateSpace) -> float:
     return float(np.median(sizes[sizes > 1e-3 * sizes.max()]))
 
 
-def _starts(space: StateSpace, sensed: SecondOrderModel, structured: SecondOrderModel | None) -> list[Triple]:
+def _starts(space: StateSpace, sensed: SecondOrderModel, structured: SecondOrderModel | None) -> list[tuple]:
     """CBSI as it is, CBSI with the damping ratios of the poles alone, and the nominal numbers."""
     starts = []
     if structured is not None:
@@ -148,7 +148,7 @@ def _starts(space: StateSpace, sensed: SecondOrderModel, structured: SecondOrder
         mass, damping, stiffness = _lifted(mass, 1e-3), _lifted(damping, 0.0), _lifted(stiffness, 0.0)
         starts += [(mass, damping, stiffness), (mass, _proportional(mass, stiffness, space), stiffness)]
     starts.append(tuple(np.asarray(x) for x in (sensed.mass, sensed.damping, sensed.stiffness)))
-    return [tuple(map(jnp.asarray, start)) for start in starts]  # pyright: ignore[reportReturnType]
+    return starts
 
 
 def _lifted(matrix: np.ndarray, floor: float) -> np.ndarray:

@@ -75,7 +75,7 @@ def _minimal(matrices: SecondOrderModel, space: StateSpace) -> Realization:
     pole = laguerre_pole(float(lines.band[1]), float(lines.dt))
     sampled = discretise(physical_displacement_velocity(matrices), lines.dt, hold=lines.hold)
     shifted = shift_to_laguerre(sampled.A, sampled.B, sampled.C, sampled.D, pole)
-    h = _markov(*shifted, 2 * WINDOW + 1)
+    h = _markov(*shifted, 2 * WINDOW)
     ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="fitted matrices")
     return era(ir, order=len(space.raw.A), rows=WINDOW - 1, cols=WINDOW - 1)
 
@@ -138,7 +138,7 @@ def _deviations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations of abs(s) and -real(s) / abs(s)."""
     size = np.maximum(np.abs(poles), np.finfo(float).tiny)
-    frequency = (slopes * poles.conj()[:, None]).real / size[:, None]
-    ratio = -slopes.real / size[:, None] + (poles.real / size**2)[:, None] * frequency
+    frequency = np.real(slopes * poles.conj()[:, None]) / size[:, None]
+    ratio = -np.real(slopes) / size[:, None] + (np.real(poles) / size**2)[:, None] * frequency
     spread = lambda x: np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", x, covariance, x), 0.0))  # noqa: E731
     return spread(frequency), spread(ratio)

@@ -58,8 +58,7 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
     """
     pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
     theta = jnp.asarray(_denominators(np.asarray(realization.A), float(pole)))
-    noise = _level(lines.y, lines.weight)
-    noise = jnp.broadcast_to(jnp.sqrt((noise**2).mean(axis=0)), noise.shape)
+    noise = _first_noise(lines)
     for _ in range(rounds + 1):
         theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole)
     samples = max(4 * len(theta) + 2, 200)
@@ -133,6 +132,13 @@ def _solve(design: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]
 
 
 @eqx.filter_jit
+def _first_noise(lines: Lines) -> Array:
+    """The same level for all lines of an output, as long as nothing is known."""
+    power = (jnp.abs(lines.y) ** 2 * lines.weight).sum(axis=0) / jnp.maximum(lines.weight.sum(axis=0), 1.0)
+    return jnp.broadcast_to(jnp.sqrt(power), lines.y.shape)
+
+
+@eqx.filter_jit
 def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
@@ -163,6 +169,7 @@ def _level(x: Array, weight: Array) -> Array:
     return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
 
 
+@eqx.filter_jit
 def _markov_parameters(theta: Array, response: Array, samples: int) -> Array:
     """Markov parameters in the shift w of the partial fractions, (samples, outputs, inputs)."""
     pairs = len(theta) // 2
