@@ -80,7 +80,7 @@ class PositiveMatrices(eqx.Module):
             root = jnp.sqrt(jnp.diag(scale))
             inner = jnp.linalg.pinv(e) @ matrix @ jnp.linalg.pinv(e).T / root / root[:, None]
             values, vectors = jnp.linalg.eigh(0.5 * (inner + inner.T))
-            values = jnp.maximum(values, 1e-4 * jnp.abs(values).max())
+            values = jnp.maximum(values, 1e-4 * jnp.abs(values).max(initial=0.0))
             lower = jnp.linalg.cholesky((vectors * values) @ vectors.T)
             parts.append(lower[np.tril_indices(len(scale))])
         return jnp.concatenate(parts)
@@ -101,7 +101,7 @@ def entry_sizes(
     sizes = []
     for matrix, e in zip((matrices[0], 0.01 * rate * matrices[0], matrices[2]), complements, strict=True):
         diagonal = np.abs(np.diag(np.linalg.pinv(e) @ matrix @ np.linalg.pinv(e).T))
-        root = np.sqrt(np.maximum(diagonal, 1e-6 * diagonal.max()))
+        root = np.sqrt(np.maximum(diagonal, 1e-6 * diagonal.max(initial=0.0)))
         sizes.append(root * root[:, None])
     return sizes[0], sizes[1], sizes[2]
 

@@ -47,33 +47,38 @@ def time_fit(
     owner = np.where(np.asarray(lines.weight).any(axis=1), np.asarray(lines.record).argmax(axis=1), -1)
     for i, r in enumerate(records):
         rows = [outputs.index(n) for n in r.outputs]
-        seen = ContinuousModel(model.A, model.B, model.C[np.array(rows)], model.D[np.array(rows)])
-        y = np.asarray(_prediction(seen, r, at_rest))
-        predictions.append(jnp.asarray(y))
-        measured, samples = np.asarray(r.y), len(y)
-        error = measured - y
-        inside = 2 * (np.asarray(noise)[owner == i][:, rows] ** 2).sum(axis=0)
+        measured, samples = np.asarray(r.y), len(r.y)
+        whole = np.full((samples, len(outputs)), np.nan)
+        whole[:, rows] = measured
+        predictions.append(_prediction(model, r, whole, at_rest))
+        error = measured - np.asarray(predictions[-1])[:, rows]
+        level = np.asarray(noise)[owner == i][:, rows] ** 2
+        inside = 2 * level.sum(axis=0)
         left[rows] += (error**2).sum(axis=0)
-        floor[rows] += inside + _outside_band(error - error.mean(axis=0), float(r.dt), np.asarray(lines.band))
+        floor[rows] += inside + _outside_band(error, level[0], float(r.dt), np.asarray(lines.band))
         size[rows] += samples * measured.var(axis=0)
     size = np.where(size > 0, size, 1.0)
     return TimeFit(tuple(predictions), np.sqrt(left / size), np.sqrt(np.minimum(floor, left) / size))
 
 
-def _prediction(model: ContinuousModel, record: Record, at_rest: bool) -> Array:
+def _prediction(model: ContinuousModel, record: Record, y: np.ndarray, at_rest: bool) -> Array:
+    """All outputs, from the initial state that fits the measured ones, NaN elsewhere in y."""
     sampled = discretise(model, record.dt, hold=record.hold)
     if at_rest:
         return simulate_linear(sampled, record.u)
-    state = estimate_initial_state(sampled, record.u, record.y).state
+    state = estimate_initial_state(sampled, record.u, y).state
     return simulate_linear(sampled, record.u, initial_state=state)
 
 
-def _outside_band(error: np.ndarray, dt: float, band: np.ndarray) -> np.ndarray:
-    """Sum of squares of the error at frequencies that the inputs do not excite, where all of it is noise."""
+def _outside_band(error: np.ndarray, lowest: np.ndarray, dt: float, band: np.ndarray) -> np.ndarray:
+    """Sum of squares of the noise at frequencies that the inputs do not excite.
+
+    Above the band all of the error is noise. Below it may be drift of the model, so that the level of the
+    lowest lines is carried on.
+    """
     f = np.fft.rfftfreq(len(error), dt)
-    outside = (f < band[0]) | (f > band[1])
-    power = np.abs(np.fft.rfft(error, axis=0)[outside]) ** 2
-    return 2 * power.sum(axis=0) / len(error)
+    power = np.abs(np.fft.rfft(error, axis=0)[f > band[1]]) ** 2
+    return 2 * power.sum(axis=0) / len(error) + 2 * lowest * ((f > 0) & (f < band[0])).sum()
 
 
 def frequency_fits(

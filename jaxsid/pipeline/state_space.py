@@ -109,11 +109,14 @@ def _reason(raw: Realization, order: int | None, expected: int) -> str:
     choice = select_order(values, expected=expected)
     if order is not None:
         return f"order {order} was asked for; the singular values suggest: {choice.reason}"
-    own = select_order(values)
-    agree = "agree" if own.order == expected else f"alone would suggest {own.order}"
+    drops = values[:-1] / np.maximum(values[1:], np.finfo(float).tiny)
+    steepest = int(np.argmax(drops[1:])) + 2
+    compared = "more than after any other" if steepest == expected else (
+        f"{drops[steepest - 1]:.3g} times after {steepest}"
+    )  # fmt: skip
     return (
-        f"The model's bodies and sensors have {expected} visible states; the singular values {agree} "
-        f"({own.reason.rstrip('.')})."
+        f"Bodies and sensors of the model have {expected} visible states; the singular values fall "
+        f"{drops[expected - 1]:.3g} times after value {expected}, {compared}."
     )
 
 

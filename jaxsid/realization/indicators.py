@@ -6,6 +6,8 @@ from jaxtyping import Array, Complex, Float
 
 from jaxsid.records import Indicators, Realization
 
+FADED = 0.05  # part of its first amplitude below which a mode has nothing left to compare
+
 
 def mode_indicators(
     realization: Realization,
@@ -20,7 +22,8 @@ def mode_indicators(
     amplitude ratio and phase of the last block row of P Psi against c_i lambda_i^s, and of the last block
     column of Psi^-1 Q likewise, averaged with the squared components as weights; the product. MPC:
     see `phase_collinearity`. CMI = EMAC MPC. In a Laguerre shift the factors advance by lambda_w = (lambda -
-    a) / (1 - a lambda).
+    a) / (1 - a lambda). Where a mode dies out within the window, the last block in which 5 % of it is left takes
+    the place of the last one, which would compare noise.
 
     Args:
         realization: with its observability and controllability factors.
@@ -90,10 +93,12 @@ def _coherence(
 def _consistency(
     blocks: Complex[Array, "n count channels"], lam: Complex[Array, " n"], steps: tuple[int, ...]
 ) -> Float[Array, " n"]:
-    """One half of EMAC: the last block against the first one carried there, in amplitude and phase."""
-    last = int(np.argmax(steps))
-    found, first = blocks[:, last], blocks[:, 0]
-    expected = first * _powers(lam, steps)[:, last, None]
+    """One half of EMAC: a late block against the first one carried there, in amplitude and phase."""
+    first, powers = blocks[:, 0], _powers(lam, steps)
+    alive = (jnp.abs(powers) >= FADED) | (jnp.arange(len(steps)) <= 1)
+    late = jnp.argmax(jnp.where(alive, np.asarray(steps), -1), axis=1)[:, None]
+    found = jnp.take_along_axis(blocks, late[:, :, None], axis=1)[:, 0]
+    expected = first * jnp.take_along_axis(powers, late, axis=1)
     sizes = jnp.abs(found), jnp.abs(expected)
     amplitude = _ratio(jnp.minimum(*sizes), jnp.maximum(*sizes))
     phase = jnp.abs(jnp.angle(found * jnp.conj(expected)))
