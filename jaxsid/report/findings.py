@@ -79,8 +79,8 @@ def modes_table(found: Identification) -> Table:
         note += (
             "MAC, EMAC and MPC near 1: a mode the data support (steady decay, the same over the whole "
             f"response, one phase for all sensors); below {TRUSTED} look at it twice. EMAC compares the "
-            "end of the impulse response with its start: it is low, without harm, for a mode that has "
-            "died out by then. MSV: the share in the response."
+            "late impulse response, where 5 % of the mode is left, with its start. MSV: the share in "
+            "the response."
         )
     return Table(header + (("MAC", "EMAC", "MPC", "MSV") if rated else ()), rows, "Modes", note)
 
