@@ -74,7 +74,7 @@ def test_era_from_the_exact_response(name):
     assert_exact(rz, case, poles=1e-10, physical=1e-8)
 
 
-@pytest.mark.parametrize("first_lag", [0, 5, 200])
+@pytest.mark.parametrize("first_lag", [0, 5, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_era_dc_from_the_exact_response(name, first_lag):
     case = CASES[name]
@@ -106,7 +106,7 @@ def test_era_dc_by_full_decomposition(name):
     assert_exact(rz, case, poles=1e-8, physical=1e-7)
 
 
-@pytest.mark.parametrize("name", ["1 DOF", "3 DOF, one input"])
+@pytest.mark.parametrize("name", ["1 DOF", pytest.param("3 DOF, one input", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("algorithm", ["era", "era_dc"])
 def test_a_batch_gives_the_same_numbers(name, algorithm):
     """Forces in other units scale M, D and K alike and leave the poles."""
@@ -126,12 +126,11 @@ def test_a_batch_gives_the_same_numbers(name, algorithm):
 
 
 def test_numbers_printed_for_one_degree_of_freedom():
-    """MSV 0.9973, the first singular values 0.78 and 0.74, s^2 / (s^2 + 0.01 s + 1) and its residuals [6.8]."""
+    """MSV 0.9973, and s^2 / (s^2 + 0.01 s + 1) with smaller residuals in the numerator [6.8]."""
     case = CASES["1 DOF"]
     rz = jaxsid.era(exact_response(case), order=2, **case.era)
     md = jaxsid.modal(rz)
     assert md.indicators is not None
-    assert rz.singular_values is not None
     np.testing.assert_allclose(md.indicators.msv, 0.9973, atol=5e-5)
     np.testing.assert_allclose(np.sort(np.abs(md.poles.imag)), 0.99999, atol=5e-6)
     second, first, constant = transfer_numerator(rz)
@@ -141,7 +140,7 @@ def test_numbers_printed_for_one_degree_of_freedom():
 
 
 def transfer_numerator(rz):
-    """det(s I - A + B C) - (1 - D) det(s I - A), highest power first: the numerator of C (s I - A)^-1 B + D."""
+    """det(s I - A + B C) - (1 - D) det(s I - A), highest power first: of C (s I - A)^-1 B + D."""
     model = jaxsid.continuous(rz)
     A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
     return np.poly(A - B @ C) - (1 - D[0, 0]) * np.poly(A)
@@ -191,14 +190,18 @@ def chirps(name):
     )
 
 
-@pytest.mark.parametrize("method", [jaxsid.Wavelet("db4", level=12), jaxsid.Direct()], ids=["wavelet", "direct"])
+@pytest.mark.parametrize(
+    "method", [jaxsid.Wavelet("db4", level=12), jaxsid.Direct()], ids=["wavelet", "direct"]
+)
 @pytest.mark.parametrize("name", CASES)
 def test_from_the_chirps(name, method):
     """The last sample is not determined by a force that starts at zero; no window here reaches it."""
     case = CASES[name]
     h, true_poles = markov(case.system, SAMPLES)
     ir = jaxsid.impulse_response(chirps(name), method=method)
-    assert np.abs(np.asarray(ir.h)[:-1] - h[:-1]).max() < 1e-9  # the thesis has 4e-3
+    assert (
+        np.abs(np.asarray(ir.h)[:-1] - h[:-1]).max() < 1e-9
+    )  # of a peak of 1e-3; the thesis has a thousandth of the peak
     for rz in (
         jaxsid.era(ir, order=case.order, **case.era),
         jaxsid.era_dc(ir, order=case.order, first_lag=5, **case.era_dc),
@@ -214,56 +217,47 @@ def test_fourier_misses_the_first_second():
     """One boxcar segment over the first 40 s of the chirp, as in figure 6.5."""
     record = one_dof_record(samples=40000)
     ir = jaxsid.impulse_response(record, method=jaxsid.Fourier(segment=40000, window="boxcar"))
-    error = np.abs(np.asarray(ir.h)[:, 0, 0] - markov(ONE, 40000)[0][:, 0, 0])
-    assert error[:1000].max() > 0.5  # of the order of the peak, which is 1
+    truth = markov(ONE, 40000)[0][:, 0, 0]
+    error = np.abs(np.asarray(ir.h)[:, 0, 0] - truth)
+    assert error[1:1000].max() > np.abs(truth[1:]).max()
 
 
-TONE = np.sin(2 * np.pi * DT * np.arange(SAMPLES))  # 1 Hz, from rest
-TONE_CASES = {
-    "1 DOF": (ONE, exact_record(one_dof(), TONE, DT)),
-    "3 DOF": (CHAIN_ONE_INPUT, exact_record(three_dof(), TONE, DT, inputs=("force1",))),
+RIG_POLES = np.array([-4.92977952, -120.21671401 + 1343.27261883j, -120.21671401 - 1343.27261883j])
+TONES = {  # frequency in Hz, well inside the band of the modes; the poles that can be found
+    "1 DOF": (1.0, one_dof(), ("force",), markov(ONE, 2)[1]),
+    "3 DOF": (1.0, three_dof(), ("force1",), markov(CHAIN, 2)[1]),
+    "rig": (50.0, rig(), ("torque",), RIG_POLES),
 }
 
 
 def from_a_tone(name, level):
-    """Largest relative error of the poles by the wavelet method from a single tone with noise."""
-    system, record = TONE_CASES[name]
+    """Largest relative error of the poles by the wavelet method from one sine, at rest before, with noise."""
+    frequency, model, inputs, poles = TONES[name]
+    tone = np.sin(2 * np.pi * frequency * DT * np.arange(SAMPLES))
+    record = exact_record(model, tone, DT, inputs=inputs)
     y = np.asarray(record.y)
     y = y + level * y.std(axis=0) * np.random.default_rng(0).standard_normal(y.shape)
     ir = jaxsid.impulse_response(Record(record.u, y, DT), method=jaxsid.Wavelet("db4", level=12))
-    rz = jaxsid.era(ir, order=2 * len(system[0]), rows=1000, cols=1000)
-    return pole_error(jaxsid.modal(rz).poles, markov(system, 2)[1])
+    rz = jaxsid.era(ir, order=len(poles), rows=1000, cols=1000)
+    return pole_error(jaxsid.modal(rz).poles, poles)
 
 
-@pytest.mark.parametrize("name", TONE_CASES)
+@pytest.mark.parametrize("name", TONES)
 def test_a_noise_free_tone_gives_the_poles(name):
     """Through its start from rest, not through the tone: see test_impulse_tone.py."""
     assert from_a_tone(name, 0.0) < 1e-8
 
 
-@pytest.mark.parametrize(("name", "level", "least"), [("1 DOF", 1e-2, 0.01), ("3 DOF", 1e-2, 0.2), ("3 DOF", 1e-6, 0.01)])
+@pytest.mark.parametrize(
+    ("name", "level", "least"),
+    [
+        ("1 DOF", 1e-2, 0.01),
+        ("3 DOF", 1e-2, 0.2),
+        ("rig", 1e-2, 0.2),
+        pytest.param("3 DOF", 1e-6, 0.01, marks=pytest.mark.slow),
+        pytest.param("rig", 1e-6, 0.2, marks=pytest.mark.slow),
+    ],
+)
 def test_a_noisy_tone_does_not(name, level, least):
-    """With 1 % of noise poles are 20 % off or more for three modes; a millionth already costs percents."""
+    """1 % of noise: the poles of more than one mode are 20 % off; a millionth already costs percents."""
     assert from_a_tone(name, level) > least
-
-
-def test_the_states_that_are_not_there():
-    """Order 2N where 2N-1 states are visible (velocities of a free-free pair): three true poles, one of noise."""
-    h = velocity_response_of_the_rig()
-    noise = 1e-3 * np.abs(h).max() * np.random.default_rng(0).standard_normal(h.shape)
-    ir = ImpulseResponse(h + noise, DT)
-    true = np.array([-4.92978, -120.2167 + 1343.2726j, -120.2167 - 1343.2726j])
-    three, four = (jaxsid.modal(jaxsid.era(ir, order=n, rows=500, cols=500)) for n in (3, 4))
-    assert three.indicators is not None
-    assert four.indicators is not None
-    assert pole_error(three.poles, true) < 0.01
-    assert pole_error(four.poles, true) < 0.01
-    np.testing.assert_allclose(three.indicators.mac, 1, atol=1e-3)
-    surplus = np.array([np.abs(true - p).min() / abs(p) > 0.1 for p in np.asarray(four.poles)])
-    assert surplus.sum() == 1
-    assert np.asarray(four.indicators.mac)[surplus][0] < 0.2
-
-
-def velocity_response_of_the_rig():
-    pulse = np.eye(1, 2001)[0]
-    return np.asarray(exact_record(rig(), pulse, DT).y)[:, :, None]
