@@ -7,7 +7,7 @@ traced arrays, so that every public function works under `jit`, `vmap` and `grad
 from collections.abc import Sequence
 from typing import NoReturn
 
-import jax
+import jax.core
 import numpy as np
 from jaxtyping import Array
 
@@ -60,7 +60,7 @@ def check_record(record: Record) -> None:
     samples = record.u.shape[0]
     require(
         samples == record.y.shape[0],
-        f"{record.name}: u has {samples} samples but y has {record.y.shape[0]}; they must be read at the same instants.",
+        f"{record.name}: u has {samples} samples but y has {record.y.shape[0]}; read them at the same instants.",
     )
     require(record.u.shape[1] > 0 and record.y.shape[1] > 0, f"{record.name}: needs an input and an output")
     require(
@@ -96,5 +96,6 @@ def check_excitation(record: Record) -> None:
         if coherence[i, j] > 1 - 1e-10:
             bad_input(
                 f"{record.name}: inputs '{record.inputs[i]}' and '{record.inputs[j]}' are the same signal up to a "
-                "factor, so their effects cannot be told apart. Drive them independently, one after another, or drop one."
+                "factor, so their effects cannot be told apart. Drive them independently, one after another, or "
+                "drop one."
             )

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+Matrix = Array | np.ndarray
 Triple = tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]
 
 
@@ -26,13 +27,13 @@ class SymmetricMatrices(eqx.Module):
         complements: bases of the coordinates that M, D and K act on, (N, N), (N, q), (N, p).
     """
 
-    scale: tuple[Array, Array, Array]
-    complements: tuple[Array, Array, Array]
+    scale: tuple[Matrix, Matrix, Matrix]
+    complements: tuple[Matrix, Matrix, Matrix]
 
     def matrices(self, theta: Array) -> Triple:
         """M, D, K from the upper triangles."""
         M, D, K = (
-            e @ _symmetric(part, len(scale), scale) @ e.T
+            jnp.asarray(e) @ _symmetric(part, len(scale), scale) @ jnp.asarray(e).T
             for part, scale, e in zip(self._parts(theta), self.scale, self.complements, strict=True)
         )
         return M, D, K
@@ -57,8 +58,8 @@ class PositiveMatrices(eqx.Module):
         scale, complements: as for `SymmetricMatrices`.
     """
 
-    scale: tuple[Array, Array, Array]
-    complements: tuple[Array, Array, Array]
+    scale: tuple[Matrix, Matrix, Matrix]
+    complements: tuple[Matrix, Matrix, Matrix]
 
     def matrices(self, theta: Array) -> Triple:
         """M, D, K from lower triangular factors."""
@@ -106,7 +107,7 @@ def entry_sizes(
     return sizes[0], sizes[1], sizes[2]
 
 
-def _symmetric(upper: Array, size: int, scale: Array) -> Array:
+def _symmetric(upper: Array, size: int, scale: Matrix) -> Array:
     i, j = np.triu_indices(size)
     x = jnp.zeros((size, size), upper.dtype).at[i, j].set(upper)
     return (x + jnp.triu(x, 1).T) * scale

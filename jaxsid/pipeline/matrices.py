@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxsid.checks import JaxsidError
 from jaxsid.mechanics.lumped import LumpedModel, second_order
@@ -74,12 +75,15 @@ def _sensed(model: LumpedModel, system: Setting) -> SecondOrderModel:
         whole.damping,
         whole.stiffness,
         whole.input_matrix,
-        *(
-            jnp.asarray(np.asarray(h)[rows])
-            for h in (whole.displacement_sensors, whole.velocity_sensors, whole.acceleration_sensors)
-        ),
+        _rows(whole.displacement_sensors, rows),
+        _rows(whole.velocity_sensors, rows),
+        _rows(whole.acceleration_sensors, rows),
         None,
     )
+
+
+def _rows(x: Array, rows: np.ndarray) -> Array:
+    return jnp.asarray(np.asarray(x)[rows])
 
 
 def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, tuple[str, ...]]:

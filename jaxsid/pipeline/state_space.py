@@ -14,7 +14,6 @@ from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.mechanics.hold import continuous, discretise
 from jaxsid.realization.era import era
 from jaxsid.realization.era_dc import era_dc
-from jaxsid.realization.order import select_order
 from jaxsid.realization.polish import Polished, polish
 from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
 
@@ -106,9 +105,8 @@ def _realize(response: ImpulseResponse, order: int, realization: str) -> Realiza
 
 def _reason(raw: Realization, order: int | None, expected: int) -> str:
     values = np.asarray(raw.singular_values)
-    choice = select_order(values, expected=expected)
     if order is not None:
-        return f"order {order} was asked for; the singular values suggest: {choice.reason}"
+        return f"Order {order} was asked for; bodies and sensors of the model have {expected} visible states."
     drops = values[:-1] / np.maximum(values[1:], np.finfo(float).tiny)
     steepest = int(np.argmax(drops[1:])) + 2
     compared = "more than after any other" if steepest == expected else (

@@ -70,10 +70,10 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
 
 def _denominators(A: np.ndarray, pole: float) -> np.ndarray:
     """Coefficients a_1, a_2 of each pole pair in the shift w, then the odd real pole if there is one."""
-    eigenvalues = np.linalg.eigvals(A)
-    eigenvalues = laguerre_shift(eigenvalues, pole)
-    above = eigenvalues[eigenvalues.imag > 1e-12]
-    real = list(np.sort(eigenvalues[np.abs(eigenvalues.imag) <= 1e-12].real))
+    eigenvalues = laguerre_shift(np.linalg.eigvals(A), pole)
+    height = np.imag(eigenvalues)
+    above = eigenvalues[height > 1e-12]
+    real = list(np.sort(np.real(eigenvalues[np.abs(height) <= 1e-12])))
     pairs = [(-2 * p.real, abs(p) ** 2) for p in above]
     while len(real) > 1:  # slowest with fastest, so that no pair starts as a double pole
         low, high = real.pop(0), real.pop()
