@@ -1,5 +1,6 @@
 """The immutable values that flow through the library: records in, models out. No algorithm lives here."""
 
+import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -8,6 +9,16 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 HOLDS = ("zero", "first", "band")
 SENSOR_KINDS = ("displacement", "velocity", "acceleration")
+
+
+def warn_single_precision(x: Array) -> None:
+    """Warn, once for each place that builds data, where the data is in single precision."""
+    if x.dtype == jnp.float32:
+        warnings.warn(
+            "single precision costs accuracy: poles near the unit circle need double. Switch it on before building "
+            "data: jax.config.update('jax_enable_x64', True).",
+            stacklevel=3,
+        )
 
 
 def floating(x: ArrayLike) -> Array:
@@ -73,6 +84,7 @@ class Record(eqx.Module):
         self.outputs = named(outputs, "output", y.shape[-1])
         self.hold = holds(hold, u.shape[-1])
         self.name = name
+        warn_single_precision(y)
 
 
 class ImpulseResponse(eqx.Module):

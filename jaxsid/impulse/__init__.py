@@ -1,0 +1,1 @@
+"""Impulse responses (Markov parameters) from records: one estimator a file, one signature for all."""
