@@ -17,7 +17,6 @@ the
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -62,11 +61,11 @@ class Direct(eqx.Module):
         steps: dimension of the Krylov space.
     """
 
-    solver: Literal["auto", "exact", "regularized"] = eqx.field(static=True, default="auto")
+    solver: str = eqx.field(static=True, default="auto")
     ridge: float | None = eqx.field(static=True, default=None)
     taps: int | None = eqx.field(static=True, default=None)
     skip: int = eqx.field(static=True, default=0)
-    history: Literal["rest", "unknown"] = eqx.field(static=True, default="rest")
+    history: str = eqx.field(static=True, default="rest")
     steps: int = eqx.field(static=True, default=60)
 
     def __call__(self, records: Sequence[Record], samples: int | None = None) -> ImpulseResponse:

@@ -15,7 +15,6 @@ rounding error are lost, which `Wavelet` and `Direct` do not lose.
 """
 
 from collections.abc import Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -48,7 +47,7 @@ class WaveletEnsemble(eqx.Module):
             carries the diagonal D through the solution; the estimate is the same.
     """
 
-    variant: Literal["products", "correlations"] = eqx.field(static=True, default="products")
+    variant: str = eqx.field(static=True, default="products")
     wavelet: str = eqx.field(static=True, default="db4")
     level: int | None = eqx.field(static=True, default=None)
     taps: int | None = eqx.field(static=True, default=None)

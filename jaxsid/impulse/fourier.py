@@ -1,7 +1,6 @@
 """Impulse response as the inverse Fourier transform of an averaged frequency response."""
 
 from collections.abc import Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,7 +27,7 @@ class Fourier(eqx.Module):
         periods: number of whole periods in each record.
     """
 
-    estimator: Literal["h1", "h2", "hv"] = eqx.field(static=True, default="h1")
+    estimator: str = eqx.field(static=True, default="h1")
     segment: int | None = eqx.field(static=True, default=None)
     overlap: float = eqx.field(static=True, default=0.5)
     window: str = eqx.field(static=True, default="hann")

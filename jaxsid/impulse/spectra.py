@@ -8,7 +8,6 @@ Source: J. Bendat and A. Piersol, Random Data, 4th ed., chapters 6 and 7.
 """
 
 from collections.abc import Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -219,7 +218,7 @@ def respond(S: Spectra, estimator: str) -> FrequencyResponse:
 def frequency_response(
     records: Record | Sequence[Record],
     *,
-    estimator: Literal["h1", "h2", "hv"] = "h1",
+    estimator: str = "h1",
     segment: int | None = None,
     overlap: float = 0.5,
     window: str = "hann",

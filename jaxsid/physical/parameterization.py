@@ -1,6 +1,6 @@
 """Unknowns that a fit may vary, and the mass, damping and stiffness that they mean."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ Matrix = Array | np.ndarray
 Triple = tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]
 
 
+@runtime_checkable
 class Parameterization(Protocol):
     """Maps unknowns to mass, damping, stiffness, differentiably, and back."""
 

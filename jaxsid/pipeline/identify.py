@@ -1,7 +1,6 @@
 """The whole chain: records to impulse response, order, state-space model, modes, mass, damping and stiffness."""
 
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,8 +30,8 @@ def identify(
     order: int | None = None,
     band: tuple[float, float] | None = None,
     method: ImpulseMethod | None = None,
-    realization: Literal["era", "era_dc"] = "era",
-    initial: Literal["estimate", "rest"] = "estimate",
+    realization: str = "era",
+    initial: str = "estimate",
     progress: Progress | None = None,
 ) -> Identification:
     """Impulse response, state-space model, modes and M, D, K of a system, from records of its inputs and outputs.

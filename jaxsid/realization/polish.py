@@ -25,6 +25,8 @@ from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, Realization
 
 STEPS = 30
+EDGE = 1.001  # largest size of a pole in the Laguerre shift: room for a rigid body in noise
+FASTEST = 0.01  # least real pole z: what is faster is gone after a sample, and below 0 it alternates in sign
 NEIGHBOURS = 24  # lines on either side over which the noise spectrum is averaged
 
 
@@ -57,7 +59,7 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
         rounds: how often the noise spectrum is estimated anew and the fit repeated.
     """
     pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
-    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(pole)))
+    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(pole), float(_least(lines, pole))))
     noise = _first_noise(lines)
     for _ in range(rounds + 1):
         theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole)
@@ -68,17 +70,45 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
     return Polished(refined, noise, residual, transient, theta, covariance)
 
 
-def _denominators(A: np.ndarray, pole: float) -> np.ndarray:
+def _denominators(A: np.ndarray, pole: float, least: float) -> np.ndarray:
     """Coefficients a_1, a_2 of each pole pair in the shift w, then the odd real pole if there is one."""
     eigenvalues = laguerre_shift(np.linalg.eigvals(A), pole)
     height = np.imag(eigenvalues)
-    above = eigenvalues[height > 1e-12]
-    real = list(np.sort(np.real(eigenvalues[np.abs(height) <= 1e-12])))
+    above = _mirrored(eigenvalues[height > 1e-12])
+    real = _mirrored(np.real(eigenvalues[np.abs(height) <= 1e-12]))
+    real = list(np.sort(np.maximum(real, 0.9 * least)))
     pairs = [(-2 * p.real, abs(p) ** 2) for p in above]
     while len(real) > 1:  # slowest with fastest, so that no pair starts as a double pole
         low, high = real.pop(0), real.pop()
         pairs.append((-(low + high), low * high))
     return np.concatenate([np.ravel(pairs), [-p for p in real]])
+
+
+def _mirrored(w: np.ndarray) -> np.ndarray:
+    """Poles outside of the unit circle, which only noise puts there, mirrored into it."""
+    return w / np.maximum(np.abs(w), 1.0) ** 2
+
+
+def _least(lines: Lines, pole: Array) -> Array:
+    """The least real pole: gone after a sample for held inputs, any for band-limited ones."""
+    return -jnp.ones(()) if "band" in lines.hold else laguerre_shift(jnp.asarray(FASTEST), pole)
+
+
+def _possible(theta: Array, least: Array) -> Array:
+    """Whether a passive system, sampled, can have these poles: none grows, no real one alternates in sign.
+
+    Poles elsewhere may fit the lines of a band as well.
+
+    Args:
+        theta: denominators.
+        least: the least real pole, in the Laguerre shift.
+    """
+    pairs = len(theta) // 2
+    a1, a2 = theta[: 2 * pairs].reshape(pairs, 2).T
+    single = -theta[2 * pairs :]
+    stable = (a2 < EDGE**2) & (jnp.abs(a1) < EDGE + a2 / EDGE)
+    steady = (a1**2 < 4 * a2) | ((least**2 + a1 * least + a2 > 0) & (-a1 / 2 > least))
+    return (stable & steady).all() & ((jnp.abs(single) < EDGE) & (single > least)).all()
 
 
 def _sections(theta: Array, w: Array) -> Array:
@@ -142,7 +172,14 @@ def _first_noise(lines: Lines) -> Array:
 def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
-    found = levenberg_marquardt(forward(lambda t: _projected_residual(t, args)), theta, max_steps=STEPS)
+    least = _least(lines, pole)
+    both = forward(lambda t: _projected_residual(t, args))
+
+    def evaluate(t: Array) -> tuple[Array, Array]:
+        residual, jacobian = both(t)
+        return jnp.where(_possible(t, least), residual, jnp.inf), jacobian
+
+    found = levenberg_marquardt(evaluate, theta, max_steps=STEPS)
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
     design = _design(theta, lines, pole)
     weight = lines.weight / noise

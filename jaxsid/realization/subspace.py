@@ -9,7 +9,7 @@ Comput. 27, 2005 (restarting).
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ ROUGH_RESTARTS = 2
 BLOCK_ELEMENTS = 4096  # of a block of rows in a QR factorization
 
 
+@runtime_checkable
 class LinearOperator(Protocol):
     """Something with products; also a pytree, linear in its array leaves."""
 
