@@ -3,6 +3,7 @@
 PYTHON ?=
 VENV := .venv
 BIN := $(VENV)/bin
+PEERS := .venv-bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --benchmark-disable
 
@@ -24,14 +25,24 @@ test: lint
 test-all: lint
 	$(BIN)/python -m $(CHECKED)
 
-bench: $(STAMP)
-	$(BIN)/python -m pytest benchmarks --benchmark-only
+# The peers live in an environment of their own; the figures go into benchmarks/README.md.
+bench: $(STAMP) $(PEERS)/.installed
+	mkdir -p build/bench
+	$(PEERS)/bin/python benchmarks/peers.py build/bench/peers.json
+	$(BIN)/python benchmarks/structure.py build/bench/structure.json
+	$(BIN)/python -m pytest benchmarks --benchmark-only -p no:cacheprovider --benchmark-json build/bench/timings.json
+	$(BIN)/python benchmarks/write_tables.py build/bench/timings.json build/bench/structure.json build/bench/peers.json
+
+$(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
+	$(BIN)/python -m venv --clear $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check -c benchmarks/constraints.txt control mdof
+	@touch $@
 
 notebooks: $(STAMP)
 	$(BIN)/jupyter nbconvert --execute --to html --output-dir build/notebooks notebooks/*.ipynb
 
 clean:
-	rm -rf $(VENV) demo build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf $(VENV) $(PEERS) demo build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
 
 # A name on the PATH may be a shim for a version that is not there, and a system Python may lack venv: try each.
 $(STAMP): pyproject.toml constraints.txt

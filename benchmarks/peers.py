@@ -1,0 +1,107 @@
+"""python-control and mdof on the flexible structure, and python-control on the ERA timings.
+
+    .venv-bench/bin/python benchmarks/peers.py OUT.json
+
+They run in an environment of their own. Each is given several settings, with and without the inputs taken one
+sample early, and keeps the one that predicts the held-out samples best: a choice in its favour, which a user
+without those samples could not make.
+"""
+
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+
+import control
+import flexible_structure as data
+import mdof
+import numpy as np
+
+warnings.simplefilter("ignore")  # an unstable model overflows: an outcome here, and reported as one
+np.seterr(all="ignore")
+Model = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Attempt = tuple[str, Callable[[], Model]]
+ADVANCES = (0, 1)  # samples by which the inputs are taken early
+
+
+def control_attempts(u: np.ndarray, y: np.ndarray) -> Iterator[Attempt]:
+    """Markov parameters by least squares, then ERA; the least squares are shared by all orders."""
+    for count in (400, 900):
+        response = np.asarray(control.markov(y.T, u.T, m=count, truncate=True))
+        for order in (40, 60, 100):
+
+            def attempt(response: np.ndarray = response, order: int = order) -> Model:
+                found, _ = control.eigensys_realization(response, order, m=60, n=250)
+                return found.A, found.B, found.C, found.D
+
+            yield f"markov({count}), eigensys_realization(order {order})", attempt
+
+
+def mdof_attempts(u: np.ndarray, y: np.ndarray) -> Iterator[Attempt]:
+    """OKID with ERA, and SRIM."""
+    for lags, order in ((40, 40), (40, 60)):
+        options = {"method": "okid-era", "m": lags, "horizon": lags // 2, "nc": lags // 2, "order": order}
+        yield f"okid-era(m {lags}, order {order})", lambda o=options: tuple(mdof.sysid(u.T, y.T, **o))
+    for horizon, order in ((10, 40), (20, 40), (20, 60)):
+        options = {"method": "srim", "horizon": horizon, "order": order}
+        yield f"srim(horizon {horizon}, order {order})", lambda o=options: tuple(mdof.sysid(u.T, y.T, **o))
+
+
+def score(attempt: Callable[[], Model], u: np.ndarray, y: np.ndarray) -> tuple[list[float], float]:
+    """NRMSE of each output on held-out samples, infinite where the tool gives no usable model; seconds."""
+    begin = time.perf_counter()
+    try:
+        A, B, C, D = (np.real(np.asarray(x)) for x in attempt())
+        seconds = time.perf_counter() - begin
+        return data.nrmse(data.predict(A, B, C, D, u, y), y).tolist(), seconds
+    except (np.linalg.LinAlgError, ValueError, AssertionError, FloatingPointError):
+        return [float("inf")] * y.shape[1], time.perf_counter() - begin
+
+
+def trials(attempts: Callable[[np.ndarray, np.ndarray], Iterator[Attempt]]) -> list[dict]:
+    """Every setting of one tool."""
+    u, y, u_held, y_held = data.load()
+    rows = []
+    for advance in ADVANCES:
+        keep, held = len(u) - advance, len(u_held) - advance
+        for words, attempt in attempts(u[advance:], y[:keep]):
+            wrong, seconds = score(attempt, u_held[advance:], y_held[:held])
+            words += ", inputs one sample early" if advance else ""
+            rows.append({"setting": words, "nrmse": wrong, "seconds": seconds})
+            print(f"{words}: median {np.median(wrong):.3g}, {seconds:.1f} s", file=sys.stderr, flush=True)
+    return rows
+
+
+def chain_response(samples: int, masses: int) -> np.ndarray:
+    """Markov parameters (masses, masses, samples) of a stable chain; any will do for a timing."""
+    stiffness = 4 * np.eye(masses) - 2 * np.eye(masses, k=1) - 2 * np.eye(masses, k=-1)
+    values, shapes = np.linalg.eigh(stiffness)
+    t = 0.05 * np.arange(samples)
+    decay = np.exp(-0.02 * t) * np.sin(np.sqrt(values)[:, None] * t)
+    return np.einsum("im,jm,mt->ijt", shapes, shapes, decay)
+
+
+def era_seconds(masses: int, blocks: int) -> float:
+    """One ERA by python-control."""
+    response = chain_response(2 * blocks + 1, masses)
+    begin = time.perf_counter()
+    control.eigensys_realization(response, 2 * masses, m=blocks, n=blocks)
+    return time.perf_counter() - begin
+
+
+def main() -> None:
+    found = {
+        "versions": {name: version(name) for name in ("control", "mdof")},
+        "era": {"1000 x 1000, order 2": era_seconds(1, 1000), "3000 x 3000, order 6": era_seconds(3, 1000)},
+        "structure": {},
+    }
+    if data.data_file().exists():
+        found["structure"] = {"mdof": trials(mdof_attempts), "python-control": trials(control_attempts)}
+    with open(sys.argv[1], "w") as file:
+        json.dump(found, file)
+
+
+if __name__ == "__main__":
+    main()

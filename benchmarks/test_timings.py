@@ -1,0 +1,106 @@
+"""Timings, run by `make bench`; they assert nothing about speed.
+
+ERA against the full singular value decomposition of numpy on the same matrix, the impulse-response estimators,
+and the command `jaxsid identify` as a whole process, with an empty compilation cache and with a filled one.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsid
+from jaxsid.examples import systems, truth
+
+jax.config.update("jax_enable_x64", True)
+SIZES = {"1000 x 1000, order 2": (1, 2), "3000 x 3000, order 6": (3, 6)}
+BLOCKS = 1000
+
+
+def chain_response(masses: int) -> np.ndarray:
+    """Accelerations of the one- and three-mass systems to impulses, (samples, masses, masses)."""
+    from jaxsid.mechanics.first_order import physical_displacement_velocity
+    from jaxsid.mechanics.simulate import impulse_response_of
+
+    model = jaxsid.second_order(systems.one_dof() if masses == 1 else systems.three_dof())
+    return np.asarray(
+        impulse_response_of(physical_displacement_velocity(model), 0.05, samples=2 * BLOCKS + 1).h
+    )
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.benchmark(group="era")
+def test_era(benchmark, size):
+    masses, order = SIZES[size]
+    response = jaxsid.ImpulseResponse(chain_response(masses), 0.05)
+    run = lambda: jax.block_until_ready(jaxsid.era(response, order=order, rows=BLOCKS, cols=BLOCKS))  # noqa: E731
+    run()
+    found = benchmark.pedantic(run, rounds=5)
+    exact = np.asarray(response.h[1:100])
+    again = np.asarray(jaxsid.markov_parameters(found, samples=100))[1:]
+    benchmark.extra_info["error"] = float(np.abs(again - exact).max() / np.abs(exact).max())
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.benchmark(group="era")
+def test_numpy_svd(benchmark, size):
+    masses, _ = SIZES[size]
+    h = chain_response(masses)
+    k = np.arange(BLOCKS)
+    matrix = h[1 + k[:, None] + k].transpose(0, 2, 1, 3).reshape(BLOCKS * masses, -1)
+    benchmark.pedantic(np.linalg.svd, (matrix,), {"full_matrices": False}, rounds=1)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [jaxsid.Fourier(), jaxsid.Direct(), jaxsid.Wavelet(), jaxsid.InBand()],
+    ids=lambda m: type(m).__name__,
+)
+@pytest.mark.benchmark(group="impulse response, 4096 samples")
+def test_impulse_response(benchmark, method):
+    record = truth.one_dof_record(samples=4096)
+    noise = np.random.default_rng(0).normal(size=record.y.shape) * 0.01 * np.asarray(record.y).std()
+    record = jaxsid.Record(record.u, record.y + noise, record.dt)
+    run = lambda: jax.block_until_ready(jaxsid.impulse_response(record, method=method).h)  # noqa: E731
+    run()
+    benchmark.pedantic(run, rounds=3)
+
+
+@pytest.fixture(scope="module")
+def rig_case(tmp_path_factory):
+    """A chain of three masses, 20 000 samples of one random force and three accelerations, as files."""
+    folder = tmp_path_factory.mktemp("identify")
+    model = systems.three_dof()
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(20_000, 3))
+    record = jaxsid.Record(u, np.zeros((20_000, 0)), 0.05, inputs=[i.name for i in model.inputs], outputs=())
+    y = np.asarray(jaxsid.simulate(model, record))
+    y = y + 0.01 * y.std(axis=0) * rng.normal(size=y.shape)
+    names = ["time", *record.inputs, *(s.name for s in model.sensors)]
+    table = np.column_stack([0.05 * np.arange(len(u)), u, y])
+    np.savetxt(folder / "record.csv", table, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    jaxsid.write_model(model, folder / "model.toml")
+    return folder
+
+
+@pytest.mark.parametrize("cache", ["empty compilation cache", "filled compilation cache"])
+@pytest.mark.benchmark(group="jaxsid identify, 20 000 samples, whole process")
+def test_identify_process(benchmark, rig_case, cache):
+    """In this order: the first fills the cache that the second uses."""
+    command = [str(Path(sys.executable).with_name("jaxsid")), "identify", "model.toml", "record.csv"]
+    environment = os.environ | {"JAXSID_CACHE": str(rig_case / "cache")}
+
+    def run():
+        subprocess.run(
+            [*command, "--out", "out", "--quiet"],
+            cwd=rig_case,
+            env=environment,
+            check=True,
+            capture_output=True,
+        )
+
+    benchmark.pedantic(run, rounds=1)
