@@ -30,7 +30,7 @@ def bad_input(message: str) -> NoReturn:
     raise InputError(message)
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: bool | np.bool_, message: str) -> None:
     """Raise InputError(message) unless the condition, on shapes or options, holds."""
     if not condition:
         raise InputError(message)

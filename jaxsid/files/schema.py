@@ -3,7 +3,7 @@
 Import it inside functions: pydantic is slow to load.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -86,7 +86,7 @@ class RecordTable(Strict):
     columns: dict[str, str | int] = {}
     scale: dict[str, Number] = {}
     rate: Annotated[Number, Field(gt=0)] | None = None
-    time_unit: str | None = None
+    time_unit: Literal["s", "ms", "us"] | None = None
 
 
 class RecordsFile(Strict):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsid.checks import InsufficientDataError, is_concrete, require
 from jaxsid.mechanics.functions_of_matrices import logarithm, phi_functions
@@ -64,7 +64,7 @@ def _ramps(each: tuple[str, ...]) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _sample(model: ContinuousModel, dt: Array, ramps: np.ndarray) -> tuple[Array, Array, Array, Array]:
+def _sample(model: ContinuousModel, dt: Array, ramps: Bool[Array, " inputs"] | np.ndarray) -> tuple[Array, Array, Array, Array]:
     L = model.A * dt
     one, two = phi_functions(L)
     A = jnp.eye(len(L), dtype=L.dtype) + L @ one
@@ -116,7 +116,7 @@ def _check_poles(A: np.ndarray, band: bool) -> None:
 
 
 @eqx.filter_jit
-def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: np.ndarray) -> ContinuousModel:
+def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: Bool[Array, " inputs"] | np.ndarray) -> ContinuousModel:
     L, found = logarithm(A)
     one, two = phi_functions(jnp.where(found, L, 0.0))
     step = jnp.linalg.solve(one, B) / dt
