@@ -21,6 +21,7 @@ from jaxsid.records import Record
 
 # Excited means: smoothed input power within this ratio of its largest value.
 EXCITED = 1 / 400
+FEWEST_LINES = 12  # with power; a tone has up to six
 # The band is spread over this part of the circle of the Laguerre shift, so that regressions in it are well posed.
 BAND_ANGLE = 0.8 * np.pi
 Points = TypeVar("Points", Array, np.ndarray)
@@ -84,7 +85,20 @@ def excited_band(records: Sequence[Record]) -> tuple[float, float]:
             f"{records[0].name}: the inputs share no band of frequencies with power in it "
             f"({len(excited)} spectral lines). Excite a band (sweep, noise, multisine) that covers the modes."
         )
+    tones = int(np.sum([_strong_lines(r) for r in records], axis=0).min())
+    if tones < FEWEST_LINES:
+        raise InsufficientDataError(
+            f"{records[0].name}: an input holds hardly more than a single tone ({tones} spectral lines): it tells of "
+            "one frequency, not of a band. Excite a band (sweep, noise, multisine) that covers the modes."
+        )
     return float(grid[excited[0]]), float(grid[excited[-1]])
+
+
+def _strong_lines(record: Record) -> np.ndarray:
+    """For each input the number of lines with power; a Hann window keeps a tone to a few."""
+    u = np.asarray(record.u, dtype=float)
+    power = np.abs(np.fft.rfft((u - u.mean(axis=0)) * np.hanning(len(u))[:, None], axis=0)) ** 2
+    return (power > EXCITED * np.maximum(power.max(axis=0), np.finfo(float).tiny)).sum(axis=0)
 
 
 def _smoothed_power(record: Record, grid: np.ndarray) -> np.ndarray:
@@ -133,7 +147,15 @@ def record_lines(
         band is not None or all(is_concrete(r.u, r.dt) for r in records),
         "name the band when the records are traced",
     )
-    band = excited_band(records) if band is None else band
+    if band is None:
+        band = excited_band(records)
+    else:
+        nyquist = min(0.5 / float(r.dt) for r in records)
+        require(
+            0 <= band[0] < band[1] and band[0] < nyquist,
+            f"band {band[0]:g} to {band[1]:g} Hz cannot be used: name the lower end first, below {nyquist:g} Hz, which "
+            "is half the sampling rate.",
+        )
     dt = float(max(records, key=lambda r: r.u.shape[0]).dt)
     parts = [_one_record(r, names, band, dt) for r in records]
     lines = [np.concatenate([p[i] for p in parts]) for i in range(5)]

@@ -179,6 +179,16 @@ def _positive(matrices: Triple) -> bool:
     return bool(mass[0] > 0 and all(x[0] >= -1e-9 * abs(x[-1]) for x in (damping, stiffness)))
 
 
+def _vague(fit: MatrixFit) -> list[str]:
+    """Matrices whose standard deviation is larger than they are, or is no number."""
+    names = ("mass", "damping", "stiffness")
+    sizes = [
+        (float(jnp.linalg.norm(d)), float(jnp.linalg.norm(x)))
+        for d, x in zip(fit.deviation, fit.matrices, strict=True)
+    ]
+    return [name for name, (spread, size) in zip(names, sizes, strict=True) if not spread < size]
+
+
 def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[str, ...]:
     notes = []
     if (
@@ -189,6 +199,11 @@ def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[
         notes.append(
             f"CBSI met {int(structured.diagnostics.negative_scales)} mode(s) with a negative scale: shape and driving "
             "point contradict each other. Check polarity, place and gain of sensors and inputs."
+        )
+    if fit is not None and (vague := _vague(fit)):
+        notes.append(
+            f"The records hardly determine the {' and '.join(vague)}: standard deviations exceed the values. Excite a "
+            "wider band that covers all modes, or record longer."
         )
     if fit is None:
         notes.append("No symmetric positive mass, damping and stiffness could be fitted to the records.")
