@@ -17,6 +17,9 @@ from jaxsid.mechanics.functions_of_matrices import logarithm, phi_functions
 from jaxsid.records import HOLDS, ContinuousModel, Realization, holds
 
 
+Ramps = Bool[Array, " inputs"] | np.ndarray  # which inputs are held to first order
+
+
 def check_holds(hold: str | Sequence[str], inputs: int) -> tuple[str, ...]:
     """One hold for each input, or InputError.
 
@@ -64,7 +67,7 @@ def _ramps(each: tuple[str, ...]) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _sample(model: ContinuousModel, dt: Array, ramps: Bool[Array, " inputs"] | np.ndarray) -> tuple[Array, Array, Array, Array]:
+def _sample(model: ContinuousModel, dt: Array, ramps: Ramps) -> tuple[Array, Array, Array, Array]:
     L = model.A * dt
     one, two = phi_functions(L)
     A = jnp.eye(len(L), dtype=L.dtype) + L @ one
@@ -116,7 +119,7 @@ def _check_poles(A: np.ndarray, band: bool) -> None:
 
 
 @eqx.filter_jit
-def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: Bool[Array, " inputs"] | np.ndarray) -> ContinuousModel:
+def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: Ramps) -> ContinuousModel:
     L, found = logarithm(A)
     one, two = phi_functions(jnp.where(found, L, 0.0))
     step = jnp.linalg.solve(one, B) / dt
