@@ -16,7 +16,6 @@ from jaxsid.checks import InsufficientDataError, is_concrete, require
 from jaxsid.mechanics.functions_of_matrices import logarithm, phi_functions
 from jaxsid.records import HOLDS, ContinuousModel, Realization, holds
 
-
 Ramps = Bool[Array, " inputs"] | np.ndarray  # which inputs are held to first order
 
 
