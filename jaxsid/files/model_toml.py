@@ -33,6 +33,9 @@ def read_model(path: Path | str) -> LumpedModel:
 
     Masses in kg (kg m^2), stiffness N/m (N m), damping N s/m (N m s).
 
+    Args:
+        path: of the file.
+
     Raises:
         InputError: naming file, table and key, where the file is missing, is not TOML, has unknown keys
             or wrong types, or describes no possible mechanical system.
@@ -143,6 +146,11 @@ def parameter(value: object, where: str) -> np.ndarray:
 
 def write_model(model: LumpedModel, path: Path | str, header: str = "Lumped mechanical model.") -> None:
     """Write the model as TOML that `read_model` turns into an equal model; the header becomes comment lines.
+
+    Args:
+        model: to write.
+        path: of the file.
+        header: what the file is, in words.
 
     Raises InputError where the folder is missing or cannot be written to.
     """

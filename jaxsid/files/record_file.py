@@ -45,6 +45,10 @@ def read_record(path: Path | str, model: LumpedModel) -> Record:
     The inputs are those of the model, in its order and with its holds; the outputs those sensors of the
     model that the file holds, at least one. Units are SI after scaling; time in s unless told otherwise.
 
+    Args:
+        path: of the file or list.
+        model: gives the names to look for.
+
     Raises:
         InputError: naming file, column and row of what is missing or cannot be used.
     """
@@ -57,7 +61,12 @@ def read_record(path: Path | str, model: LumpedModel) -> Record:
 
 
 def read_records(paths: Path | str | Sequence[Path | str], model: LumpedModel) -> list[Record]:
-    """All experiments of some files, each a record or a TOML list of records; see `read_record`."""
+    """All experiments of some files, each a record or a TOML list of records; see `read_record`.
+
+    Args:
+        paths: one file, or several.
+        model: gives the names to look for.
+    """
     paths = [paths] if isinstance(paths, (str, Path)) else list(paths)
     require(len(paths) > 0, "No record was given.")
     return [record_of(entry, model) for path in paths for entry in entries_of(Path(path), model)]

@@ -263,6 +263,16 @@ def coherence(
     window: str = "hann",
     detrend: bool = False,
 ) -> tuple[Float[Array, " f"], Float[Array, "f outputs inputs"], Float[Array, "f outputs"]]:
-    """Frequencies (Hz), ordinary coherence and multiple coherence; arguments as in `frequency_response`."""
+    """Frequencies (Hz), ordinary coherence (f, outputs, inputs) and multiple coherence (f, outputs).
+
+    Args:
+        records: a Record or several of the same channels and rate.
+        segment: samples of a segment, a quarter of the shortest record if None.
+        overlap: share of a segment that the next repeats.
+        window: boxcar, hann, hamming, blackman or flattop.
+        detrend: take the mean from each segment.
+
+    Raises InputError where an option does not fit the records.
+    """
     found = frequency_response(records, segment=segment, overlap=overlap, window=window, detrend=detrend)
     return found.frequencies, found.coherence, found.multiple_coherence

@@ -13,7 +13,7 @@ from jaxsid.mechanics.lumped import LumpedModel, Matrices, lumped_model
 from jaxsid.mechanics.simulate import markov_parameters
 from jaxsid.pipeline.fit import frequency_fits, time_fit
 from jaxsid.pipeline.matrices import POOR, Found, find_matrices
-from jaxsid.pipeline.modes import final_modes
+from jaxsid.pipeline.modes import FinalModes, final_modes
 from jaxsid.pipeline.setting import Setting, setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
 from jaxsid.realization.stabilization import Stabilization, stabilization
@@ -64,9 +64,7 @@ def identify(
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose estimate or rest.")
     system = setting(model, records)
-    for r in records if len(model.inputs) == 1 else ():
-        check_excitation(r)
-    check_enough(records, order or system.visible)
+    _check_records(model, records, order or system.visible)
     say("impulse response in the excited band")
     lines = record_lines(records, outputs=system.outputs, band=band)
     space = state_space(
@@ -79,9 +77,21 @@ def identify(
     explained = found.fit is not None and float(found.fit.misfit) < POOR
     say("modes, stabilization, fit")
     final = final_modes(space, found.model if explained else None, found.fit if explained else None)
-    times = time_fit(
-        final.continuous, records, system.outputs, space.lines, space.polished.noise, initial == "rest"
-    )
+    return _collect(model, records, system, space, found, final, initial == "rest")
+
+
+def _collect(
+    model: LumpedModel,
+    records: tuple[Record, ...],
+    system: Setting,
+    space: StateSpace,
+    found: Found,
+    final: FinalModes,
+    at_rest: bool,
+) -> Identification:
+    """The stages' results in one value, with the comparison in time and in frequency."""
+    lines = space.lines
+    times = time_fit(final.continuous, records, system.outputs, lines, space.polished.noise, at_rest)
     return Identification(
         nominal=model,
         records=records,
@@ -173,13 +183,10 @@ def _missing(model: LumpedModel, system: Setting) -> tuple[str, ...]:
     return (f"No record holds {', '.join(absent)}.",) if absent else ()
 
 
-def check_enough(records: Sequence[Record], order: int) -> None:
-    """Raise InsufficientDataError where the records are shorter than any model of this order needs.
-
-    Args:
-        records: of one system.
-        order: number of states.
-    """
+def _check_records(model: LumpedModel, records: Sequence[Record], order: int) -> None:
+    """Raise where the records excite nothing, or are shorter than any model of this order needs."""
+    for r in records if len(model.inputs) == 1 else ():
+        check_excitation(r)
     samples = sum(r.u.shape[0] for r in records)
     needed = 10 * order
     if samples < needed:
