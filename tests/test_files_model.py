@@ -90,9 +90,6 @@ def test_reads_matrices(tmp_path):
     np.testing.assert_array_equal(model.matrices.stiffness, [[3, -1], [-1, 1]])
 
 
-jnp.zeros(())  # starts JAX, which seeds itself by `random`, before hypothesis looks
-
-
 @st.composite
 def models(draw):
     bodies = draw(st.lists(words.filter(lambda w: w != "ground"), min_size=1, max_size=3, unique=True))
