@@ -41,9 +41,13 @@ def errors(model):
 
 
 def assert_identified(found):
-    """Targets: 1 % for inertias and stiffness, 5 % for damping; reached are parts in ten thousand."""
+    """Targets: 1 % for inertias and stiffness, 5 % for damping; reached are parts in ten thousand.
+
+    The bounds are four standard deviations of one record (Cramer-Rao) or more: 0.12 % for the slow pole.
+    """
     poles = np.asarray(found.modal.poles)
-    assert pole_error(poles[np.abs(poles) > 1e-6], POLES) < 1e-3
+    assert pole_error(poles, POLES[:1]) < 5e-3
+    assert pole_error(poles, POLES[1:]) < 1e-4
     inertia_m, inertia_l, stiffness, *damping = np.abs(errors(found.matrices))
     assert max(inertia_m, inertia_l, stiffness) < 1e-3
     assert max(damping) < 5e-3
