@@ -77,7 +77,7 @@ class Identification(eqx.Module):
     matrices: SecondOrderModel | None
     matrices_std: MatrixDeviation | None
     identified: LumpedModel | None
-    predictions: tuple[Float[Array, "samples outputs"], ...]
+    predictions: tuple[Float[Array, "_ outputs"], ...]
     train_nrmse: Float[Array, " outputs"]
     noise_floor: Float[Array, " outputs"]
     frequency_fit: tuple[FrequencyFit, ...]

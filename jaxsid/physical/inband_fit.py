@@ -143,7 +143,7 @@ def fit_matrices(
 
 
 def _lines_and_slopes(
-    target: Target, matrices: Triple, slopes: Triple, sensed: SecondOrderModel
+    target: Target, matrices: Triple, slopes: tuple[Float[Array, "N N p"], ...], sensed: SecondOrderModel
 ) -> tuple[Array, Array]:
     """Modelled lines (lines, outputs) and their derivatives (lines, unknowns, outputs)."""
     s = target.s[:, None, None]
