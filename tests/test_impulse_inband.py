@@ -1,0 +1,110 @@
+"""Lines and the in-band observer: exact Markov parameters in the Laguerre shift, from records of any state."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from band_limited import DT, band_noise, chain, poles, respond, state_space
+from scipy import signal
+
+from jaxsid.checks import InputError, InsufficientDataError
+from jaxsid.impulse.inband import InBand, observer_response, output_groups
+from jaxsid.impulse.lines import excited_band, laguerre_pole, laguerre_shift, record_lines
+from jaxsid.realization.era import era
+from jaxsid.records import Record
+
+SYSTEM = chain([1.2, 0.9], [3000, 2500], [1.5, 1.2])
+
+
+@pytest.fixture(scope="module")
+def record():
+    u = band_noise(np.random.default_rng(0), 8000, 1)
+    return Record(u, respond(SYSTEM, u, state=np.array([0.01, -0.02, 1.0, 0.5])), DT)
+
+
+@pytest.fixture(scope="module")
+def lines(record):
+    return record_lines([record])
+
+
+def shifted_markov(pole, samples):
+    """Coefficients of G in powers of 1/w, from values of G on the unit circle of w."""
+    A, B, C, D, _ = signal.cont2discrete(state_space(SYSTEM), DT)
+    n = 1 << 14
+    w = np.exp(2j * np.pi * np.arange(n) / n)
+    z = (w + pole) / (1 + pole * w)
+    G = C @ np.linalg.solve(z[:, None, None] * np.eye(4) - A, B[None]) + D
+    return np.fft.ifft(G, axis=0).real[:samples]
+
+
+def test_lines_obey_the_transfer_function_up_to_a_transient_of_its_poles(record, lines):
+    A, B, C, D, _ = signal.cont2discrete(state_space(SYSTEM), DT)
+    z, used = np.asarray(lines.z), np.asarray(lines.weight)[:, 0] > 0
+    z = z[used]
+    G = C @ np.linalg.solve(z[:, None, None] * np.eye(4) - A, B[None]) + D
+    transient = np.asarray(lines.y)[used] - np.einsum("koi,ki->ko", G, np.asarray(lines.u)[used])
+    shapes = np.hstack([1 / (z[:, None] - np.linalg.eigvals(A)), np.ones((len(z), 1))])
+    left = transient - shapes @ np.linalg.lstsq(shapes, transient)[0]
+    assert np.linalg.norm(left) < 1e-9 * np.linalg.norm(np.asarray(lines.y))
+    assert np.linalg.norm(transient) > 1e-3 * np.linalg.norm(np.asarray(lines.y))
+
+
+def test_markov_parameters_without_noise_are_exact(lines):
+    found = observer_response(lines)
+    truth = shifted_markov(float(found.pole), len(found.h))
+    assert np.linalg.norm(found.h - truth) < 1e-4 * np.linalg.norm(truth)
+    own = np.log(np.linalg.eigvals(np.asarray(era(found, order=4, rows=90, cols=90).A))) / DT
+    for p in poles(SYSTEM):
+        assert np.abs(own - p).min() < 1e-6 * abs(p)
+
+
+def test_noise_is_estimated(record):
+    rng = np.random.default_rng(1)
+    noise = 0.02 * np.asarray(record.y).std(axis=0)
+    noisy = Record(record.u, record.y + noise * rng.standard_normal(record.y.shape), DT)
+    found = InBand()([noisy])
+    assert found.noise_std is not None
+    assert found.band is not None
+    assert "in-band observer" in found.method
+    truth = shifted_markov(float(found.pole), 60)
+    assert np.linalg.norm(found.h[:60] - truth) < 0.1 * np.linalg.norm(truth)
+
+
+def test_the_shift_keeps_the_circle_and_spreads_the_band():
+    pole = laguerre_pole(60.0, DT)
+    z = np.exp(2j * np.pi * DT * np.array([0.0, 30.0, 60.0]))
+    w = laguerre_shift(z, pole)
+    np.testing.assert_allclose(np.abs(w), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.angle(w)[[0, 2]], [0, 0.8 * np.pi], atol=1e-9)
+    assert laguerre_pole(500.0, DT) == 0.0
+
+
+def test_the_band_that_is_excited():
+    u = band_noise(np.random.default_rng(2), 20000, 1)
+    low, high = excited_band([Record(u, u, DT)])
+    assert 0.3 < low < 1.1
+    assert 59 < high < 110
+
+
+def test_outputs_are_grouped_by_the_records_that_hold_them(record):
+    parts = [Record(record.u, record.y[:, [i]], DT, outputs=[f"s{i}"]) for i in range(2)]
+    lines = record_lines(parts)
+    assert [list(g) for g in output_groups(lines)] in ([[0], [1]], [[1], [0]])
+    whole = observer_response(lines)
+    assert whole.h.shape == (200, 2, 1)
+    truth = shifted_markov(float(whole.pole), 200)
+    assert np.linalg.norm(whole.h - truth) < 1e-3 * np.linalg.norm(truth)
+
+
+def test_what_cannot_be_used_is_told(record):
+    lines = record_lines([record])
+    with pytest.raises(InputError, match="too short to realize"):
+        observer_response(lines, samples=2)
+    with pytest.raises(InputError, match="lower end first"):
+        record_lines([record], band=(60.0, 1.0))
+    with pytest.raises(InsufficientDataError, match="spectral lines"):
+        record_lines([record], band=(10.0, 10.2))
+    tone = Record(jnp.sin(2 * jnp.pi * 10.03 * DT * jnp.arange(8000)), record.y, DT)
+    with pytest.raises(InsufficientDataError, match="single tone"):
+        record_lines([tone])
+    with pytest.raises(InputError, match="differ from those"):
+        record_lines([record, Record(record.u, record.y, DT, inputs=["other"])])
