@@ -100,9 +100,9 @@ class LumpedModel(eqx.Module):
 
 def lumped_model(
     bodies: Sequence[str],
-    mass: ArrayLike | Sequence[float] = (),
-    stiffness: ArrayLike | Sequence[float] = (),
-    damping: ArrayLike | Sequence[float] = (),
+    mass: ArrayLike | Sequence[float | int] = (),
+    stiffness: ArrayLike | Sequence[float | int] = (),
+    damping: ArrayLike | Sequence[float | int] = (),
     *,
     connections: Sequence[Connection] = (),
     matrices: Matrices | None = None,
