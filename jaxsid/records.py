@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +10,9 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 HOLDS = ("zero", "first", "band")
 SENSOR_KINDS = ("displacement", "velocity", "acceleration")
+
+
+Values = ArrayLike | Sequence[Any]  # an array, or lists of numbers
 
 
 def warn_single_precision(x: Array) -> None:
@@ -21,13 +25,13 @@ def warn_single_precision(x: Array) -> None:
         )
 
 
-def floating(x: ArrayLike) -> Array:
+def floating(x: Values) -> Array:
     """An array of the default floating type, unless it is one of another floating type already."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
-def columns(x: ArrayLike) -> Array:
+def columns(x: Values) -> Array:
     """A (samples, channels) array; one channel may be given as a vector."""
     x = floating(x)
     return x[:, None] if x.ndim == 1 else x
@@ -69,9 +73,9 @@ class Record(eqx.Module):
 
     def __init__(
         self,
-        u: ArrayLike,
-        y: ArrayLike,
-        dt: ArrayLike,
+        u: Values,
+        y: Values,
+        dt: Values,
         *,
         inputs: Sequence[str] | None = None,
         outputs: Sequence[str] | None = None,
@@ -114,12 +118,12 @@ class ImpulseResponse(eqx.Module):
 
     def __init__(
         self,
-        h: ArrayLike,
-        dt: ArrayLike,
+        h: Values,
+        dt: Values,
         *,
-        pole: ArrayLike = 0.0,
-        noise_std: ArrayLike | None = None,
-        band: ArrayLike | None = None,
+        pole: Values = 0.0,
+        noise_std: Values | None = None,
+        band: Values | None = None,
         hold: str | Sequence[str] = "zero",
         method: str = "given",
     ):
@@ -161,16 +165,16 @@ class Realization(eqx.Module):
 
     def __init__(
         self,
-        A: ArrayLike,
-        B: ArrayLike,
-        C: ArrayLike,
-        D: ArrayLike,
-        dt: ArrayLike,
+        A: Values,
+        B: Values,
+        C: Values,
+        D: Values,
+        dt: Values,
         *,
-        singular_values: ArrayLike | None = None,
-        observability: ArrayLike | None = None,
-        controllability: ArrayLike | None = None,
-        pole: ArrayLike = 0.0,
+        singular_values: Values | None = None,
+        observability: Values | None = None,
+        controllability: Values | None = None,
+        pole: Values = 0.0,
         row_steps: Sequence[int] = (),
         column_steps: Sequence[int] = (),
         hold: str | Sequence[str] = "zero",

@@ -67,9 +67,10 @@ class Effect(eqx.Module):
 class Matrices(eqx.Module):
     """Mass, damping and stiffness (N, N), given instead of elements."""
 
+    # a shape of its own each: `check_lumped` compares them, and says what is wrong in words
     mass: Float[Array, "N N"]
-    damping: Float[Array, "N N"]
-    stiffness: Float[Array, "N N"]
+    damping: Float[Array, "P P"]
+    stiffness: Float[Array, "Q Q"]
 
 
 class LumpedModel(eqx.Module):
@@ -87,7 +88,7 @@ class LumpedModel(eqx.Module):
 
     mass: Float[Array, " N"]
     stiffness: Float[Array, " c"]
-    damping: Float[Array, " c"]
+    damping: Float[Array, " d"]
     matrices: Matrices | None
     bodies: tuple[str, ...] = eqx.field(static=True)
     connections: tuple[Connection, ...] = eqx.field(static=True)
@@ -108,7 +109,7 @@ def lumped_model(
     matrices: Matrices | None = None,
     inputs: Sequence[Input] = (),
     sensors: Sequence[Sensor] = (),
-    tolerance: Tolerance = NOMINAL,
+    tolerance: Tolerance | tuple[float, float, float] = NOMINAL,
     effects: Sequence[Effect] = (),
     name: str = "model",
 ) -> LumpedModel:
