@@ -61,7 +61,7 @@ def identification(samples: int = 4000) -> Identification:
         truth.mass * 1.002, truth.damping * 0.97, truth.stiffness * 1.001, truth.input_matrix,
         truth.displacement_sensors, truth.velocity_sensors, truth.acceleration_sensors, diagnostics=None,
     )  # fmt: skip
-    diagnostics = CbsiDiagnostics(*(jnp.asarray(x) for x in (2e-3, 5e-4, 1e-3, 2e-2, 4e-4, 0)))
+    diagnostics = CbsiDiagnostics(*(jnp.asarray(x) for x in (2e-3, 5e-4, 1e-3, 2e-2, 4e-4, 0.0)))
     deviation = MatrixDeviation(
         *(0.004 * jnp.abs(x) + 1e-3 * jnp.abs(x).max() for x in (truth.mass, truth.damping, truth.stiffness))
     )
