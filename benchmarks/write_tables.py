@@ -64,7 +64,8 @@ def main() -> None:
     text = README.read_text()
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}."
+    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+    machine += f", load average {os.getloadavg()[2]:.1f} (above the number of cores: times are inflated)."
     parts = [
         machine,
         "",
