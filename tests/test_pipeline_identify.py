@@ -274,7 +274,7 @@ def test_fewer_sensors_than_bodies_still_give_modes(model, noisy):
 def test_an_order_that_is_not_the_models_gives_modes_without_matrices(model, noisy):
     found = identify(model, noisy, order=8)
     assert (found.order, found.matrices) == (8, None)
-    assert "order 8 was asked for" in found.order_reason
+    assert "Order 8 was asked for" in found.order_reason
     assert any("6 visible states" in w for w in found.warnings)
     assert nearest_modes(found, SYSTEM)[:, 0].max() < USUAL.frequency
 
