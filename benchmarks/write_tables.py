@@ -65,7 +65,7 @@ def main() -> None:
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    machine += f", load average {os.getloadavg()[2]:.1f} (above the number of cores: times are inflated)."
+    machine += f", load average {os.getloadavg()[2]:.1f}."
     parts = [
         machine,
         "",
