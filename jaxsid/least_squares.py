@@ -48,7 +48,7 @@ def levenberg_marquardt(
     evaluate: Callable[[Array], tuple[Array, Array]],
     start: Float[Array, " n"],
     *,
-    max_steps: int,
+    max_steps: int | Array,
     tolerance: float = 1e-10,
 ) -> Minimum:
     """The unknowns that minimize half a sum of squares, by Levenberg and Marquardt.

@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -133,14 +134,16 @@ def test_many_sensors_and_real_poles():
     found, n = identification(), 3
     model = dataclasses.replace(
         found.modal,
-        poles=np.array([-5.0 + 0j, -1 + 20j, -1 - 20j]),
-        frequencies=np.array([5.0, 20.02, 20.02]),
-        damping_ratios=np.array([1.0, 0.05, 0.05]),
-        shapes=np.ones((40, n), complex),
+        poles=jnp.array([-5.0 + 0j, -1 + 20j, -1 - 20j]),
+        frequencies=jnp.array([5.0, 20.02, 20.02]),
+        damping_ratios=jnp.array([1.0, 0.05, 0.05]),
+        shapes=jnp.ones((40, n), complex),
+        participation=jnp.ones((n, 1), complex),
+        feedthrough=jnp.zeros((40, 1)),
         indicators=None,
     )
     nominal = lumped_model(bodies, np.ones(40), sensors=sensors, name="many")
-    nan = np.full(n, np.nan)
+    nan = jnp.full(n, jnp.nan)
     found = dataclasses.replace(
         found, nominal=nominal, outputs=tuple(s.name for s in sensors), modal=model, frequency_std=nan,
         damping_ratio_std=nan, matrices=None,

@@ -4,6 +4,7 @@ import dataclasses
 import re
 from html.parser import HTMLParser
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from report_fixture import WARNING, identification, without_matrices
@@ -152,7 +153,7 @@ def test_report_with_nothing_but_modes(found):
         without_matrices(found), frequency_fit=(), warnings=(), train_nrmse=unknown, noise_floor=unknown,
         records=(record, record), predictions=found.predictions * 2,
         response=ImpulseResponse(found.response.h, 0.005, pole=0.8),
-        frequency_std=np.full(6, np.nan), damping_ratio_std=np.full(6, np.nan),
+        frequency_std=jnp.full(6, jnp.nan), damping_ratio_std=jnp.full(6, jnp.nan),
     )  # fmt: skip
     reader = Reader(report_page(bare))
     assert "No warnings." in reader.text
@@ -188,9 +189,9 @@ def test_many_sensors_show_the_worst(found):
     many = dataclasses.replace(
         without_matrices(found), nominal=nominal, outputs=names, frequency_fit=(),
         records=(Record(record.u, y, record.dt, inputs=("force",), outputs=names),),
-        predictions=(0.9 * y,), train_nrmse=np.linspace(0.01, 0.4, count), noise_floor=np.full(count, 0.01),
-        modal=dataclasses.replace(without_matrices(found).modal, shapes=np.ones((count, 6), complex)),
-        time_response=np.ones((50, count, 1)),
+        predictions=(jnp.asarray(0.9 * y),), train_nrmse=jnp.linspace(0.01, 0.4, count), noise_floor=jnp.full(count, 0.01),
+        modal=dataclasses.replace(without_matrices(found).modal, shapes=jnp.ones((count, 6), complex), feedthrough=jnp.zeros((count, 1))),
+        time_response=jnp.ones((50, count, 1)),
         response=ImpulseResponse(np.ones((50, count, 1)), record.dt),
     )  # fmt: skip
     text = Reader(report_page(many)).text

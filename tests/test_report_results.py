@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from report_fixture import WARNING, identification, without_matrices
@@ -49,7 +50,7 @@ def test_schema_of_the_contract(found, tmp_path):
 
 def test_what_is_unknown_is_null(found):
     bare = without_matrices(found)
-    nan = np.full(6, np.nan)
+    nan = jnp.full(6, jnp.nan)
     data = identification_json(dataclasses.replace(bare, frequency_std=nan, damping_ratio_std=nan))
     json.dumps(data, allow_nan=False)
     assert data["mass"] is data["damping"] is data["stiffness"] is data["std"] is data["cbsi"] is None
@@ -59,13 +60,14 @@ def test_what_is_unknown_is_null(found):
 def test_a_real_pole_is_one_mode(found):
     modal = dataclasses.replace(
         found.modal,
-        poles=np.array([-3 + 0j, -1 + 10j, -1 - 10j]),
-        frequencies=np.array([3, 101**0.5, 101**0.5]),
-        damping_ratios=np.array([1, 101**-0.5, 101**-0.5]),
+        poles=jnp.array([-3 + 0j, -1 + 10j, -1 - 10j]),
+        frequencies=jnp.array([3, 101**0.5, 101**0.5]),
+        damping_ratios=jnp.array([1, 101**-0.5, 101**-0.5]),
+        participation=found.modal.participation[:3],
         shapes=found.modal.shapes[:, :3],
         indicators=None,
     )
-    few = np.full(3, 0.1)
+    few = jnp.full(3, 0.1)
     data = identification_json(
         dataclasses.replace(found, modal=modal, frequency_std=few, damping_ratio_std=few)
     )

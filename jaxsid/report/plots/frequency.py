@@ -28,7 +28,7 @@ def frequency_figure(found: Identification, output: str, column: int = 0, record
     row = found.outputs.index(output)
     inputs = found.records[record].inputs
     figure, axes = new_figure(
-        f"{output} / {inputs[column]}", 4.8, rows=3, ratios=(2.2, 1, 0.85), between=0.2, sharex=True
+        f"{output} / {inputs[column]}", 4.8, rows=3, ratios=(2.2, 1.0, 0.85), between=0.2, sharex=True
     )
     size, phase, coherence = axes[:, 0]
     f = np.asarray(fit.frequencies)

@@ -21,7 +21,7 @@ def time_figure(found: Identification, output: str, record: int = 0) -> Figure:
     time = np.arange(len(measured)) * float(given.dt)
     kind = sensor_kinds(found.nominal, (output,))[0]
     title = output if len(found.records) == 1 else f"{output} in {PurePath(given.name).name}"
-    figure, axes = new_figure(title, 4.4, rows=3, ratios=(1, 1.25, 0.8), between=0.36, left=0.74)
+    figure, axes = new_figure(title, 4.4, rows=3, ratios=(1.0, 1.25, 0.8), between=0.36, left=0.74)
     text = units_of(found.nominal).label(kind).replace(" (", "\n(")
     size = float(np.nanmax(np.abs(measured), initial=0.0))
     near = close_look(measured, _width(found, float(given.dt), len(time)))
