@@ -146,7 +146,7 @@ def test_report_without_matrices_and_indicators(found):
 
 def test_report_with_nothing_but_modes(found):
     """No warnings, no frequency responses, NaN for what is unknown, a Laguerre basis, an absent sensor."""
-    unknown = np.full(3, np.nan)
+    unknown = jnp.full(3, np.nan)
     y = np.asarray(found.records[0].y)[:, :2]
     record = Record(found.records[0].u, y, 0.005, inputs=("force",), outputs=("acc1", "acc2"), name="roving")
     bare = dataclasses.replace(
@@ -189,8 +189,13 @@ def test_many_sensors_show_the_worst(found):
     many = dataclasses.replace(
         without_matrices(found), nominal=nominal, outputs=names, frequency_fit=(),
         records=(Record(record.u, y, record.dt, inputs=("force",), outputs=names),),
-        predictions=(jnp.asarray(0.9 * y),), train_nrmse=jnp.linspace(0.01, 0.4, count), noise_floor=jnp.full(count, 0.01),
-        modal=dataclasses.replace(without_matrices(found).modal, shapes=jnp.ones((count, 6), complex), feedthrough=jnp.zeros((count, 1))),
+        predictions=(jnp.asarray(0.9 * y),), train_nrmse=jnp.linspace(0.01, 0.4, count),
+        noise_floor=jnp.full(count, 0.01),
+        modal=dataclasses.replace(
+            without_matrices(found).modal,
+            shapes=jnp.ones((count, 6), complex),
+            feedthrough=jnp.zeros((count, 1)),
+        ),
         time_response=jnp.ones((50, count, 1)),
         response=ImpulseResponse(np.ones((50, count, 1)), record.dt),
     )  # fmt: skip
