@@ -18,7 +18,7 @@ class OrderChoice(NamedTuple):
 
 
 def select_order(
-    singular_values: Float[Array, " k"],
+    singular_values: Float[Array, " k"] | np.ndarray,
     *,
     shape: tuple[int, int] | None = None,
     noise_floor: float | None = None,
