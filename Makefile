@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PEERS := .venv-bench
 STAMP := $(VENV)/.installed
-CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --benchmark-disable
+CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
 .PHONY: setup demo lint test test-all bench notebooks clean
 

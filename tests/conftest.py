@@ -15,9 +15,18 @@ ROOT = Path(__file__).parents[1]
 jax.config.update("jax_enable_x64", True)
 
 # Most of a run is compilation; a second run reads it from a git-ignored folder, which `make clean` removes.
-jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+# In continuous integration there is no second run, and writing to the cache has crashed a worker once.
+if not os.environ.get("CI"):
+    jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def release_programs() -> Iterator[None]:
+    """Drop the compiled programs of a file when it is done: thousands of them exhaust a process."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture
