@@ -24,8 +24,13 @@ if not os.environ.get("CI"):
 
 @pytest.fixture(autouse=True, scope="module")
 def release_programs() -> Iterator[None]:
-    """Drop the compiled programs of a file when it is done: thousands of them exhaust a process."""
+    """Drop the compiled programs of a file when it is done: thousands of them exhaust a process.
+
+    The command switches its own cache on; what was set before comes back.
+    """
+    folder = jax.config.jax_compilation_cache_dir
     yield
+    jax.config.update("jax_compilation_cache_dir", folder)
     jax.clear_caches()
 
 
