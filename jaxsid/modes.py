@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Complex
 
 from jaxsid.checks import bad_input, is_concrete, require, require_finite
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import check_holds
 from jaxsid.realization.indicators import mode_indicators
 from jaxsid.records import ContinuousModel, Indicators, ModalModel, Realization
@@ -130,7 +131,7 @@ def _form(poles, shapes, participation, feedthrough, indicators: Indicators | No
     )
 
 
-@jax.jit
+@compiled
 def _modal_continuous(model: ContinuousModel) -> ModalModel:
     poles, vectors = _eigen(model.A)
     order = _order(poles)
@@ -139,7 +140,7 @@ def _modal_continuous(model: ContinuousModel) -> ModalModel:
     return _form(poles, model.C @ vectors, rows, model.D, None)
 
 
-@jax.jit
+@compiled
 def _modal(rz: Realization) -> ModalModel:
     # The eigenvalues of A - I keep the digits that lambda near 1 would lose.
     step, vectors = _eigen(rz.A - jnp.eye(rz.A.shape[0], dtype=rz.A.dtype))

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 HOLDS = ("zero", "first", "band")
@@ -25,9 +27,14 @@ def warn_single_precision(x: Array) -> None:
         )
 
 
+def as_array(x: Values) -> Array:
+    """What jnp.asarray gives, but without a compiled program for every new shape of a numpy array."""
+    return jax.device_put(x) if isinstance(x, np.ndarray) else jnp.asarray(x)
+
+
 def floating(x: Values) -> Array:
     """An array of the default floating type, unless it is one of another floating type already."""
-    x = jnp.asarray(x)
+    x = as_array(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 

@@ -10,6 +10,8 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 import jax
 import pytest
 
+from jaxsid.compilation import keep_programs
+
 ROOT = Path(__file__).parents[1]
 
 jax.config.update("jax_enable_x64", True)
@@ -30,6 +32,7 @@ def release_programs() -> Iterator[None]:
     """
     folder = jax.config.jax_compilation_cache_dir
     yield
+    keep_programs(None)
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.clear_caches()
 

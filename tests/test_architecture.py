@@ -16,6 +16,7 @@ PACKAGE = ROOT / "jaxsid"
 
 # Low to high; a module imports from its own layer or a lower one.
 LAYERS = (
+    "compilation",
     "records",
     "checks",
     "least_squares",

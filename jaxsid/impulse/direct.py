@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsid.checks import is_concrete, require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.krylov import solve, trace_quadrature
 from jaxsid.impulse.noise import noise_level
 from jaxsid.impulse.protocol import Ensemble, as_records, returned_samples, stack
@@ -129,7 +130,7 @@ def smooth_prior(theta: Array, z: Float[Array, "taps inputs"]) -> Float[Array, "
     return jnp.concatenate([z[:1], smooth * jnp.exp(-k / (decay * m))[:, None]])
 
 
-@eqx.filter_jit
+@compiled
 def _estimate(
     ensemble: Ensemble, *, taps: int, skip: int, solver: str, steps: int, ridge: float | None
 ) -> tuple[Array, Array, Bool[Array, ""]]:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.dwt import depth, filters, idwt, levels_of
 from jaxsid.impulse.protocol import Ensemble, as_records, returned_samples, stack
 from jaxsid.records import ImpulseResponse, Record
@@ -96,7 +97,7 @@ def _transform(
     return jnp.zeros((length + 1, length + 1), dtype).at[0, 0].set(1).at[1:, 1:].set(W)
 
 
-@eqx.filter_jit
+@compiled
 def _solve(ensemble: Ensemble, W: Array, *, keep: int, variant: str, cut: float) -> tuple[Array, Array]:
     n, r, m = W.shape[0], ensemble.u.shape[2], ensemble.y.shape[2]
     D = jnp.sum(W**2, axis=1)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxsid.compilation import compiled
 from jaxsid.impulse.protocol import as_records, returned_samples
 from jaxsid.impulse.spectra import FrequencyResponse, frequency_response
 from jaxsid.records import ImpulseResponse, Record
@@ -62,7 +63,7 @@ class Fourier(eqx.Module):
         )
 
 
-@eqx.filter_jit
+@compiled
 def _inverse(found: FrequencyResponse, segment: int) -> tuple[jax.Array, jax.Array]:
     h = jnp.fft.irfft(found.H, segment, axis=0)
     variance = found.noise_psd.sum(axis=0) * (found.frequencies[1] - found.frequencies[0])

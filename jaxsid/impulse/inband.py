@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsid.checks import InsufficientDataError, require
-from jaxsid.impulse.lines import Lines, laguerre_pole, laguerre_shift, record_lines
-from jaxsid.records import ImpulseResponse, Record
+from jaxsid.compilation import compiled
+from jaxsid.impulse.lines import Lines, laguerre_shift, record_lines
+from jaxsid.records import ImpulseResponse, Record, as_array
 
 # Relative Tikhonov term: far below any noise, it only picks the smallest of many exact observers.
 RIDGE = 1e-11
@@ -67,17 +68,15 @@ def observer_response(lines: Lines, *, samples: int = 200, lags: int | None = No
         InsufficientDataError: fewer lines than unknowns.
     """
     require(samples >= 3, f"an impulse response of {samples} samples is too short to realize anything")
-    # an array, since a plain number would make a new program for every band
-    pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
+    pole = lines.pole
     h = np.zeros((samples, lines.y.shape[1], lines.u.shape[1]))
     noise, orders = np.zeros(lines.y.shape[1]), []
     for outputs in output_groups(lines):
         largest = _largest_lags(lines, outputs, lags)
-        h[:, outputs], noise[outputs], order = _observer(lines, jnp.asarray(outputs), pole, largest, samples)
+        h[:, outputs], noise[outputs], order = _observer(lines, as_array(outputs), pole, largest, samples)
         orders.append(int(order))
-    words = (
-        f"in-band observer, {float(lines.band[0]):.3g} to {float(lines.band[1]):.3g} Hz, {max(orders)} lags"
-    )
+    low, high = np.asarray(lines.band).tolist()
+    words = f"in-band observer, {low:.3g} to {high:.3g} Hz, {max(orders)} lags"
     return ImpulseResponse(
         h, lines.dt, pole=pole, noise_std=noise, band=lines.band, hold=lines.hold, method=words
     )
@@ -103,7 +102,7 @@ def _largest_lags(lines: Lines, outputs: np.ndarray, lags: int | None) -> int:
     return affordable if lags is None else min(lags, equations // 2 // width)
 
 
-@eqx.filter_jit
+@compiled
 def _observer(
     lines: Lines, outputs: Int[Array, " m"], pole: Array, largest: int, samples: int
 ) -> tuple[Float[Array, "samples m r"], Float[Array, " m"], Int[Array, ""]]:

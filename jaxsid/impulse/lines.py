@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
@@ -56,6 +56,11 @@ class Lines(eqx.Module):
     samples: tuple[int, ...] = eqx.field(static=True)
     band: Float[Array, " 2"]
     hold: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def pole(self) -> Float[Array, ""]:
+        """The Laguerre pole for this band; an array, since a plain number would compile anew for every band."""
+        return jax.device_put(np.asarray(laguerre_pole(float(np.asarray(self.band)[1]), float(self.dt))))
 
 
 def laguerre_shift(z: Points, pole: Array | float) -> Points:
@@ -169,17 +174,13 @@ def record_lines(
     padding = _bucket(sum(counts)) - sum(counts)
     z, omega, u, y, weight = (np.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)) for a in lines)
     z[sum(counts) :], omega[sum(counts) :] = z[0], omega[0]  # padding must not hit a pole
+    owner = np.pad(owner, [(0, padding), (0, 0)])
+    parts = jax.device_put((z, omega, u, y, weight, owner, np.asarray(dt)))
     return Lines(
-        z=jnp.asarray(z),
-        omega=jnp.asarray(omega),
-        u=jnp.asarray(u),
-        y=jnp.asarray(y),
-        weight=jnp.asarray(weight),
-        record=jnp.asarray(np.pad(owner, [(0, padding), (0, 0)])),
-        dt=jnp.asarray(dt),
+        *parts,
         record_dt=tuple(float(r.dt) for r in records),
         samples=tuple(r.u.shape[0] for r in records),
-        band=jnp.asarray(band),
+        band=jax.device_put(np.asarray(band, float)),
         hold=records[0].hold,
     )
 

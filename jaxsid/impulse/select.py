@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.direct import Direct
 from jaxsid.impulse.fourier import Fourier
 from jaxsid.impulse.protocol import ImpulseMethod, as_records, stack
@@ -84,7 +84,7 @@ def _padded(ir: ImpulseResponse, length: int) -> Array:
     return jnp.pad(ir.h, ((0, max(length - ir.h.shape[0], 0)), (0, 0), (0, 0)))[:length]
 
 
-@jax.jit
+@compiled
 def _score(u: Array, y: Array, unseen: Array, h: Array) -> Array:
     gap = jnp.sum(unseen[..., None] * (simulate(u, h) - y) ** 2, axis=(0, 1))
     size = jnp.sum(unseen[..., None] * y**2, axis=(0, 1))

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.protocol import as_records
 from jaxsid.records import Record
 
@@ -105,13 +106,13 @@ def spectra(
         2 <= segment <= shortest, f"segment must be between 2 and the shortest record's {shortest} samples."
     )
     w = window_samples(window, segment)
-    z = [jnp.concatenate([r.u, r.y], axis=1) for r in many]
+    z = [(r.u, r.y) for r in many]
     # With periods every record gives the same number of them; a remainder at the end is not used.
-    tables = [segments(segment * periods if periods else len(x), segment, overlap) for x in z]
-    pieces = tuple(x[t] for x, t in zip(z, tables, strict=True))
+    tables = [segments(segment * periods if periods else len(u), segment, overlap) for u, _ in z]
     return _averaged(
-        pieces,
-        jnp.asarray(w, z[0].dtype),
+        z,
+        tables,
+        jnp.asarray(w, many[0].y.dtype),
         many[0].dt,
         inputs=many[0].u.shape[1],
         detrend=detrend,
@@ -119,11 +120,19 @@ def spectra(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _averaged(
-    pieces: tuple[Array, ...], w: Array, dt: Array, *, inputs: int, detrend: bool, mean: bool
+    z: list[tuple[Array, Array]],
+    tables: list[np.ndarray],
+    w: Array,
+    dt: Array,
+    *,
+    inputs: int,
+    detrend: bool,
+    mean: bool,
 ) -> Spectra:
     n = w.shape[0]
+    pieces = [jnp.concatenate(pair, axis=1)[t] for pair, t in zip(z, tables, strict=True)]
     blocks = [p - p.mean(axis=1, keepdims=True) if detrend else p for p in pieces]
     lines = [jnp.fft.rfft(p * w[:, None], axis=1) for p in blocks]
     # One-sided: every line but 0 and Nyquist counts twice.
@@ -136,8 +145,8 @@ def _averaged(
         scatter = jnp.concatenate([jnp.abs(p - p.mean(axis=0)) ** 2 for p in lines]).sum(axis=0)
         noise = scale[..., 0] * scatter[:, inputs:] / (count - len(lines))
         lines = [p.mean(axis=0, keepdims=True) for p in lines]
-    z = jnp.concatenate(lines)
-    S = scale * jnp.einsum("sfi,sfj->fij", z, z.conj()) / z.shape[0]
+    every = jnp.concatenate(lines)
+    S = scale * jnp.einsum("sfi,sfj->fij", every, every.conj()) / every.shape[0]
     f = jnp.arange(n // 2 + 1) / (n * dt)
     return Spectra(
         frequencies=f,
@@ -197,7 +206,7 @@ def multiple(S: Spectra) -> Float[Array, "f outputs"]:
     return jnp.clip(explained / jnp.where(total > 0, total, 1), 0, 1)
 
 
-@eqx.filter_jit
+@compiled
 def respond(S: Spectra, estimator: str) -> FrequencyResponse:
     """The frequency response by the estimator named, with coherences and noise."""
     uu = jnp.real(jnp.diagonal(S.uu, axis1=1, axis2=2))

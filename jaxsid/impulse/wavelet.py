@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsid.checks import is_concrete, require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.direct import bayesian, good_enough
 from jaxsid.impulse.dwt import depth, filters, idwt, levels_of
 from jaxsid.impulse.krylov import STRENGTHS
@@ -113,7 +114,7 @@ def basis(*, wavelet: str, length: int, level: int, keep: int) -> Float[Array, "
     return idwt(jnp.eye(length, keep), wavelet=wavelet, level=level)
 
 
-@eqx.filter_jit
+@compiled
 def _shrunk(
     ensemble: Ensemble, *, shape: tuple[str, int, int], slope: float, steps: int, whole: bool
 ) -> tuple[Array, Array, Bool[Array, ""]]:
@@ -143,7 +144,7 @@ def _shrunk(
     return h, left, good
 
 
-@eqx.filter_jit
+@compiled
 def _subspace(
     ensemble: Ensemble, *, shape: tuple[str, int, int], keep: int, cut: float, slope: float | None
 ) -> tuple[Array, Array]:

@@ -5,11 +5,11 @@ All have the same transfer function. With x the state, q = [I 0] x (times Phi in
 C = [H_d 0] + [H_v 0] A + [H_a 0] A^2 and the feedthrough H_a M^-1 B.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.records import ContinuousModel, SecondOrderModel
 
 
@@ -32,7 +32,7 @@ def _per_mass(model: SecondOrderModel, x: Array) -> Array:
     return cho_solve((jnp.linalg.cholesky(model.mass), True), x)
 
 
-@eqx.filter_jit
+@compiled
 def physical_displacement_velocity(model: SecondOrderModel) -> ContinuousModel:
     """Form I, x = [q; q']: A = [[0, I], [-M^-1 K, -M^-1 D]], B = [0; M^-1 B] [thesis 3.19].
 
@@ -45,7 +45,7 @@ def physical_displacement_velocity(model: SecondOrderModel) -> ContinuousModel:
     return _observed(model, A, acceleration, eye, acceleration)
 
 
-@eqx.filter_jit
+@compiled
 def physical_displacement_momentum(model: SecondOrderModel) -> ContinuousModel:
     """Form II, x = [q; M q' + D q]: A = [[-M^-1 D, M^-1], [-K, 0]], B = [0; B] [thesis 3.21].
 
@@ -57,7 +57,7 @@ def physical_displacement_momentum(model: SecondOrderModel) -> ContinuousModel:
     return _observed(model, A, model.input_matrix, eye, _per_mass(model, model.input_matrix))
 
 
-@eqx.filter_jit
+@compiled
 def normal_modes(model: SecondOrderModel) -> tuple[Float[Array, " N"], Float[Array, "N N"]]:
     """Undamped modes: frequencies squared W^2, slowest first, and Phi, Phi' M Phi = I, Phi' K Phi = W^2.
 
@@ -82,7 +82,7 @@ def _modal_blocks(model: SecondOrderModel) -> tuple[Array, Array, Array, Array, 
     return eye, jnp.diag(squares), shapes.T @ model.damping @ shapes, shapes.T @ model.input_matrix, shapes
 
 
-@eqx.filter_jit
+@compiled
 def modal_displacement_velocity(model: SecondOrderModel) -> ContinuousModel:
     """Form III, x = [p; p'], q = Phi p: A = [[0, I], [-W^2, -Xi]], B = [0; Phi' B] [thesis 3.25].
 
@@ -94,7 +94,7 @@ def modal_displacement_velocity(model: SecondOrderModel) -> ContinuousModel:
     return _observed(model, A, forces, shapes, shapes @ forces)
 
 
-@eqx.filter_jit
+@compiled
 def modal_displacement_momentum(model: SecondOrderModel) -> ContinuousModel:
     """Form IV, x = [p; p' + Xi p], q = Phi p: A = [[-Xi, I], [-W^2, 0]], B = [0; Phi' B] [thesis 3.27].
 

@@ -7,12 +7,12 @@ No inverse of A is needed, so rigid-body poles are as good as any.
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsid.checks import InsufficientDataError, is_concrete, require
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.functions_of_matrices import logarithm, phi_functions
 from jaxsid.records import HOLDS, ContinuousModel, Realization, holds
 
@@ -65,7 +65,7 @@ def _ramps(each: tuple[str, ...]) -> np.ndarray:
     return np.array([h == "first" for h in each])
 
 
-@eqx.filter_jit
+@compiled
 def _sample(model: ContinuousModel, dt: Array, ramps: Ramps) -> tuple[Array, Array, Array, Array]:
     L = model.A * dt
     one, two = phi_functions(L)
@@ -75,7 +75,7 @@ def _sample(model: ContinuousModel, dt: Array, ramps: Ramps) -> tuple[Array, Arr
     return A, B, model.C, model.D + jnp.where(ramps, dt * model.C @ two @ model.B, 0.0)
 
 
-@eqx.filter_jit
+@compiled
 def _bilinear(model: ContinuousModel, dt: Array) -> tuple[Array, Array, Array, Array]:
     eye = jnp.eye(len(model.A), dtype=model.A.dtype)
     resolvent = jnp.linalg.inv(eye - model.A * dt / 2)
@@ -117,7 +117,7 @@ def _check_poles(A: np.ndarray, band: bool) -> None:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: Ramps) -> ContinuousModel:
     L, found = logarithm(A)
     one, two = phi_functions(jnp.where(found, L, 0.0))
@@ -127,7 +127,7 @@ def _reconstruct(A: Array, B: Array, C: Array, D: Array, dt: Array, ramps: Ramps
     return ContinuousModel(*(jnp.where(found, x, jnp.nan) for x in (L / dt, B, C, D)))
 
 
-@eqx.filter_jit
+@compiled
 def _inverse_bilinear(A: Array, B: Array, C: Array, D: Array, dt: Array) -> ContinuousModel:
     eye = jnp.eye(len(A), dtype=A.dtype)
     twice = 2 * jnp.linalg.inv(eye + A)
@@ -185,10 +185,10 @@ def shift_to_laguerre(
     Raises:
         InputError: a not inside the unit circle.
     """
-    return laguerre_to_shift(A, B, C, D, -jnp.asarray(pole))
+    return laguerre_to_shift(A, B, C, D, -jnp.asarray(pole, A.dtype))
 
 
-@eqx.filter_jit
+@compiled
 def _moebius(A: Array, B: Array, C: Array, D: Array, a: Array) -> tuple[Array, Array, Array, Array]:
     eye = jnp.eye(len(A), dtype=A.dtype)
     inverse = jnp.linalg.inv(eye + a * A)

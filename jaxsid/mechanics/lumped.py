@@ -5,13 +5,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsid.checks import bad_input, is_concrete, require, require_finite
-from jaxsid.records import HOLDS, SENSOR_KINDS, SecondOrderModel, floating
+from jaxsid.compilation import compiled
+from jaxsid.records import HOLDS, SENSOR_KINDS, SecondOrderModel, as_array, floating
 
 GROUND = "ground"
 
@@ -132,7 +132,7 @@ def lumped_model(
         InputError: unknown, reserved or duplicated names, values that no mechanical system has, wrong shapes.
     """
     model = LumpedModel(
-        *(floating(jnp.asarray(x)) for x in (mass, stiffness, damping)),
+        *(floating(x) for x in (mass, stiffness, damping)),
         matrices=matrices,
         bodies=tuple(bodies),
         connections=tuple(Connection(c[0], (c[1][0], c[1][1])) for c in connections),
@@ -292,7 +292,7 @@ def _selector(bodies: tuple[str, ...], chosen: Sequence[str | None]) -> np.ndarr
     )
 
 
-@jax.jit
+@compiled
 def _assemble(mass: Array, damping: Array, stiffness: Array, joints: Array) -> tuple[Array, Array, Array]:
     return jnp.diag(mass), (joints * damping) @ joints.T, (joints * stiffness) @ joints.T
 
@@ -306,7 +306,7 @@ def second_order(model: LumpedModel) -> SecondOrderModel:
     if model.matrices is None:
         dtype = model.mass.dtype
         mass, damping, stiffness = _assemble(
-            model.mass, model.damping, model.stiffness, incidence(model).astype(dtype)
+            model.mass, model.damping, model.stiffness, as_array(incidence(model).astype(dtype))
         )
     else:
         mass, damping, stiffness = model.matrices.mass, model.matrices.damping, model.matrices.stiffness

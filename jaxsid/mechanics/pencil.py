@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex
 
 from jaxsid.checks import InsufficientDataError, is_concrete
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.records import SecondOrderModel
 
@@ -63,7 +64,7 @@ def _check_held(model: SecondOrderModel) -> None:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _modes(model: SecondOrderModel) -> tuple[Array, Array, Array]:
     """Sorted poles, normalized shapes, and the largest entry of Z^T [[D, M], [M, 0]] Z - I."""
     A = physical_displacement_velocity(model).A
@@ -121,7 +122,7 @@ def is_proportional(model: SecondOrderModel, *, tolerance: float = 1e-9) -> Bool
     return _asymmetry(model) <= tolerance
 
 
-@eqx.filter_jit
+@compiled
 def _asymmetry(model: SecondOrderModel) -> Array:
     inverse = jnp.linalg.inv(jnp.linalg.cholesky(model.mass))
     stiffness, damping = (inverse @ x @ inverse.T for x in (model.stiffness, model.damping))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxsid.checks import bad_input, is_concrete, require, require_finite
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.band import band_response
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import check_holds, continuous, discretise
@@ -71,7 +72,7 @@ def simulate_linear(
         u.shape[1] == model.B.shape[1],
         f"the model has {model.B.shape[1]} inputs, u has {u.shape[1]} columns.",
     )
-    state = jnp.zeros(len(model.A), u.dtype) if initial_state is None else jnp.asarray(initial_state, u.dtype)
+    state = jnp.asarray(np.zeros(len(model.A)) if initial_state is None else initial_state, u.dtype)
     require(
         state.shape == (len(model.A),), f"the model has {len(model.A)} states, initial_state {state.shape}."
     )
@@ -98,8 +99,8 @@ def _ramp_part(model: ContinuousModel, sampled: Realization, u0: Array) -> Array
     return discretise(full, sampled.dt, hold=sampled.hold).D @ u0
 
 
-_run = eqx.filter_jit(run)
-_band = eqx.filter_jit(band_response)
+_run = compiled(run)
+_band = compiled(band_response)
 
 
 def markov_parameters(realization: Realization, *, samples: int) -> Float[Array, "samples outputs inputs"]:
@@ -116,7 +117,7 @@ def markov_parameters(realization: Realization, *, samples: int) -> Float[Array,
     return _markov(realization.A, realization.B, realization.C, realization.D, samples=samples)
 
 
-@eqx.filter_jit
+@compiled
 def _markov(A: Array, B: Array, C: Array, D: Array, *, samples: int) -> Array:
     return markov(A, B, C, D, samples)
 
@@ -168,7 +169,7 @@ def _checked_outputs(C: Array, u: ArrayLike, y: ArrayLike) -> Array:
     return y
 
 
-@eqx.filter_jit
+@compiled
 def _fit_state(A: Array, C: Array, residual: Array) -> InitialState:
     """Least squares on C A^k x_0 = residual_k, columns of equal norm; directions under 1e-8 stay zero."""
     free = jnp.swapaxes(powers(A.T, C.T, len(residual)), 1, 2)

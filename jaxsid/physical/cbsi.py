@@ -17,15 +17,22 @@ state-space-based system identification", AIAA J. 32 (1994).
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import continuous
 from jaxsid.physical.symmetric import symmetric_positive
-from jaxsid.records import SENSOR_KINDS, CbsiDiagnostics, ContinuousModel, Realization, SecondOrderModel
+from jaxsid.records import (
+    SENSOR_KINDS,
+    CbsiDiagnostics,
+    ContinuousModel,
+    Realization,
+    SecondOrderModel,
+    as_array,
+)
 
 SOLUTIONS = ("inverse", "symmetric")
 
@@ -67,7 +74,7 @@ def cbsi(
     rigid, loose = _patterns(rigid, len(kinds)), _patterns(loose, len(kinds))
     _check(model, kinds, places, solution, rigid.shape[1], loose.shape[1])
     complement = np.linalg.svd(rigid)[0][:, rigid.shape[1] :]
-    free, held = jnp.asarray(rigid), jnp.asarray(complement)
+    free, held = as_array(rigid), as_array(complement)
     return _cbsi(model, kinds, places, solution == "symmetric", free, held, loose.shape[1] > 0)
 
 
@@ -128,7 +135,7 @@ def _check(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _cbsi(
     model: ContinuousModel,
     kinds: tuple[str, ...],

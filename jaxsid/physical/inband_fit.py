@@ -11,11 +11,11 @@ Source: R. Pintelon and J. Schoukens, System Identification: A Frequency Domain 
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
 from jaxsid.physical.parameterization import Parameterization, Triple
@@ -60,7 +60,7 @@ class MatrixFit(NamedTuple):
     slopes: tuple[Float[Array, "N N p"], Float[Array, "N N p"], Float[Array, "N N p"]]
 
 
-@eqx.filter_jit
+@compiled
 def fit_target(
     lines: Lines,
     noise: Float[Array, "lines outputs"],
@@ -108,7 +108,7 @@ def _modal_response(model: Realization | ContinuousModel, points: Array, u: Arra
     return (driven / (points[:, None] - values)) @ (model.C @ vectors).T + u @ model.D.T
 
 
-@eqx.filter_jit
+@compiled
 def fit_matrices(
     target: Target, parameterization: Parameterization, start: Triple, sensed: SecondOrderModel
 ) -> MatrixFit:

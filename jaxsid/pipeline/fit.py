@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -14,7 +13,7 @@ from jaxsid.impulse.spectra import frequency_response
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.simulate import estimate_initial_state, simulate_linear
-from jaxsid.records import ContinuousModel, Record, SecondOrderModel
+from jaxsid.records import ContinuousModel, Record, SecondOrderModel, as_array
 
 
 class TimeFit(NamedTuple):
@@ -113,9 +112,9 @@ def frequency_fits(
         physical = None if matrices is None else physical_displacement_velocity(matrices)
         fits.append(
             FrequencyFit(
-                frequencies=jnp.asarray(f[near]),
-                measured=jnp.asarray(h),
-                coherence=jnp.asarray(coherence),
+                frequencies=as_array(f[near]),
+                measured=as_array(h),
+                coherence=as_array(coherence),
                 realization=_response(model, r, f[near]),
                 matrices=None if physical is None else _response(physical, r, f[near]),
             )
@@ -129,4 +128,4 @@ def _response(model: ContinuousModel, record: Record, f: np.ndarray) -> Array:
     z = (1 + half) / (1 - half) if record.hold[0] == "band" else np.exp(2 * half)
     sampled = discretise(model, record.dt, hold=record.hold)
     A, B, C, D = (np.asarray(x) for x in (sampled.A, sampled.B, sampled.C, sampled.D))
-    return jnp.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None]) + D)
+    return as_array(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None]) + D)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.checks import InsufficientDataError, check_excitation, require
@@ -17,7 +16,7 @@ from jaxsid.pipeline.modes import FinalModes, final_modes
 from jaxsid.pipeline.setting import Setting, setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
 from jaxsid.realization.stabilization import Stabilization, stabilization
-from jaxsid.records import Record, SecondOrderModel
+from jaxsid.records import Record, SecondOrderModel, as_array
 
 LONGEST_RESPONSE = 8192  # samples of the impulse response that is reported
 Progress = Callable[[str], None]
@@ -111,10 +110,10 @@ def _collect(
         matrices_std=None if found.fit is None else _deviation(found),
         identified=None if found.model is None else identified_model(model, found.model),
         predictions=times.predictions,
-        train_nrmse=jnp.asarray(times.nrmse),
-        noise_floor=jnp.asarray(times.floor),
+        train_nrmse=as_array(times.nrmse),
+        noise_floor=as_array(times.floor),
         frequency_fit=frequency_fits(
-            records, system.outputs, final.continuous, found.model, [float(f) for f in lines.band]
+            records, system.outputs, final.continuous, found.model, np.asarray(lines.band).tolist()
         ),
         warnings=(
             *_about_records(records, lines),
@@ -148,7 +147,7 @@ def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedMod
     mass, damping, stiffness = (0.5 * (x + x.T) for x in symmetric)
     return lumped_model(
         nominal.bodies,
-        matrices=Matrices(jnp.asarray(mass), jnp.asarray(damping), jnp.asarray(stiffness)),
+        matrices=Matrices(as_array(mass), as_array(damping), as_array(stiffness)),
         inputs=nominal.inputs,
         sensors=nominal.sensors,
         tolerance=nominal.tolerance,
@@ -168,7 +167,7 @@ def _stabilization(space: StateSpace, expected: int) -> Stabilization:
 
 
 def _about_records(records: Sequence[Record], lines: Lines) -> tuple[str, ...]:
-    low, high = (float(f) for f in lines.band)
+    low, high = np.asarray(lines.band).tolist()
     nyquist = min(0.5 / float(r.dt) for r in records)
     if high < 0.5 * nyquist:
         return (

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -13,7 +12,7 @@ from jaxsid.physical.inband_fit import MatrixFit, fit_matrices, fit_target
 from jaxsid.physical.parameterization import PositiveMatrices, SymmetricMatrices, Triple, entry_sizes
 from jaxsid.pipeline.setting import Setting
 from jaxsid.pipeline.state_space import StateSpace
-from jaxsid.records import SecondOrderModel
+from jaxsid.records import SecondOrderModel, as_array
 
 GOOD = 1.5  # mean square residual, in units of the noise, that leaves nothing to look for
 POOR = 3.0  # one that the user must hear of
@@ -83,14 +82,14 @@ def _sensed(model: LumpedModel, system: Setting) -> SecondOrderModel:
 
 
 def _rows(x: Array, rows: np.ndarray) -> Array:
-    return jnp.asarray(np.asarray(x)[rows])
+    return as_array(np.asarray(x)[rows])
 
 
 def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, tuple[str, ...]]:
     assert system.one_a_body is not None
     chosen = np.array(system.one_a_body)
     model = space.model
-    seen = type(model)(model.A, model.B, model.C[chosen], model.D[chosen])
+    seen = type(model)(model.A, model.B, _rows(model.C, chosen), _rows(model.D, chosen))
     rigid = system.rigid if system.rigid.shape[1] else None
     loose = system.loose if system.loose.shape[1] else None
     kinds = tuple(system.kinds[i] for i in chosen)
@@ -98,7 +97,7 @@ def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, 
         found = cbsi(seen, sensors=kinds, collocated=system.collocated, rigid=rigid, loose=loose)
     except JaxsidError as trouble:
         return None, (f"CBSI was left out: {trouble}",)
-    if not all(bool(jnp.isfinite(x).all()) for x in (found.mass, found.damping, found.stiffness)):
+    if not all(np.isfinite(x).all() for x in (found.mass, found.damping, found.stiffness)):
         return None, (
             "CBSI found no scale for a mode that the inputs hardly drive; the fit to the lines goes on.",
         )
@@ -122,10 +121,10 @@ def _best_fit(
         for kind in (SymmetricMatrices, PositiveMatrices):
             parameters = kind(sizes, complements)
             fit = fit_matrices(target, parameters, start, sensed)
-            if _positive(fit.matrices) and bool(jnp.isfinite(fit.misfit)):
-                best = fit if best is None or fit.misfit < best.misfit else best
+            if _positive(fit.matrices) and np.isfinite(fit.misfit):
+                best = fit if best is None or float(fit.misfit) < float(best.misfit) else best
                 break
-        if best is not None and best.misfit < GOOD:
+        if best is not None and float(best.misfit) < GOOD:
             break
     return best
 
@@ -183,7 +182,7 @@ def _vague(fit: MatrixFit) -> list[str]:
     """Matrices whose standard deviation is larger than they are, or is no number."""
     names = ("mass", "damping", "stiffness")
     sizes = [
-        (float(jnp.linalg.norm(d)), float(jnp.linalg.norm(x)))
+        (float(np.linalg.norm(d)), float(np.linalg.norm(x)))
         for d, x in zip(fit.deviation, fit.matrices, strict=True)
     ]
     return [name for name, (spread, size) in zip(names, sizes, strict=True) if not spread < size]
@@ -194,7 +193,7 @@ def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[
     if (
         structured is not None
         and structured.diagnostics is not None
-        and structured.diagnostics.negative_scales > 0
+        and int(structured.diagnostics.negative_scales) > 0
     ):
         notes.append(
             f"CBSI met {int(structured.diagnostics.negative_scales)} mode(s) with a negative scale: shape and driving "
@@ -207,7 +206,7 @@ def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[
         )
     if fit is None:
         notes.append("No symmetric positive mass, damping and stiffness could be fitted to the records.")
-    elif fit.misfit > POOR:
+    elif float(fit.misfit) > POOR:
         notes.append(
             f"Mass, damping and stiffness leave {float(fit.misfit):.3g} times the residual of the state-space model: "
             "the structure (bodies, places, kinds or gains of sensors) does not match the system in this band."

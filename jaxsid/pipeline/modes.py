@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxsid.impulse.lines import laguerre_pole
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import continuous, discretise, shift_to_laguerre
 from jaxsid.mechanics.recursion import markov
@@ -23,6 +22,7 @@ from jaxsid.records import (
     ModalModel,
     Realization,
     SecondOrderModel,
+    as_array,
 )
 
 WINDOW = 100  # block rows and columns of the realization of a model's own response
@@ -66,13 +66,13 @@ def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: Matri
             np.asarray(fit.covariance),
         )
     frequency, ratio = _deviations(np.asarray(own.poles), slopes, covariance)
-    return FinalModes(realization, model, own, jnp.asarray(frequency), jnp.asarray(ratio))
+    return FinalModes(realization, model, own, as_array(frequency), as_array(ratio))
 
 
 def _minimal(matrices: SecondOrderModel, space: StateSpace) -> Realization:
     """The visible states of M, D, K: ERA of its own Markov parameters in the Laguerre shift."""
     lines = space.lines
-    pole = laguerre_pole(float(lines.band[1]), float(lines.dt))
+    pole = lines.pole
     sampled = discretise(physical_displacement_velocity(matrices), lines.dt, hold=lines.hold)
     shifted = shift_to_laguerre(sampled.A, sampled.B, sampled.C, sampled.D, pole)
     h = _markov(*shifted, 2 * WINDOW)
@@ -80,7 +80,7 @@ def _minimal(matrices: SecondOrderModel, space: StateSpace) -> Realization:
     return era(ir, order=len(space.raw.A), rows=WINDOW - 1, cols=WINDOW - 1)
 
 
-_markov = eqx.filter_jit(markov)
+_markov = compiled(markov)
 
 
 def _nearest(measured: ModalModel, own: ModalModel) -> Indicators | None:
@@ -88,7 +88,7 @@ def _nearest(measured: ModalModel, own: ModalModel) -> Indicators | None:
         return None
     distance = np.abs(np.asarray(own.poles)[:, None] - np.asarray(measured.poles))
     index = distance.argmin(axis=1)
-    return jax.tree.map(lambda x: x[index], measured.indicators)
+    return jax.tree.map(lambda x: as_array(np.asarray(x)[index]), measured.indicators)
 
 
 def _slopes_of_matrices(matrices: SecondOrderModel, fit: MatrixFit, poles: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.checks import InsufficientDataError, require
@@ -15,7 +14,7 @@ from jaxsid.mechanics.hold import continuous, discretise
 from jaxsid.realization.era import era
 from jaxsid.realization.era_dc import era_dc
 from jaxsid.realization.polish import Polished, polish
-from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
+from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record, as_array
 
 # Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
 LAGS = 5
@@ -74,7 +73,7 @@ def state_space(
     raw = _realize(response, order_used, realization)
     reason = _reason(raw, order, expected)
     polished = polish(raw, lines)
-    if not bool(jnp.isfinite(polished.realization.A).all()):
+    if not np.isfinite(polished.realization.A).all():
         raise InsufficientDataError(
             f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
             "order, widen the band of the excitation, or lengthen the record."
@@ -140,7 +139,7 @@ def _common_rate(lines: Lines, found: Realization) -> Lines:
         own = discretise(model, dt, hold=lines.hold)
         excess = _response(own, np.exp(1j * omega[rows] * dt)) - _response(found, np.asarray(lines.z)[rows])
         y[rows] -= np.einsum("kor,kr->ko", excess, np.asarray(lines.u)[rows])
-    return eqx.tree_at(lambda x: x.y, lines, jnp.asarray(y * (np.asarray(lines.weight) > 0)))
+    return eqx.tree_at(lambda x: x.y, lines, as_array(y * (np.asarray(lines.weight) > 0)))
 
 
 def _response(model: Realization, z: np.ndarray) -> np.ndarray:

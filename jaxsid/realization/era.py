@@ -1,11 +1,10 @@
 """The eigensystem realization algorithm (ERA)."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import laguerre_to_shift
 from jaxsid.realization.hankel import DenseOperator, hankel_operator
 from jaxsid.realization.order import select_order
@@ -118,7 +117,7 @@ def named_factors(space: Subspace, observability: Array, controllability: Array)
     }
 
 
-@partial(jax.jit, static_argnums=(2, 3, 4, 5))
+@compiled
 def _era(h, pole, row_steps, column_steps, order, full):
     change = hankel_operator(jnp.diff(h, axis=0), row_steps, column_steps, 1)
     operator = hankel_operator(h, row_steps, column_steps, 1, full)
@@ -128,7 +127,7 @@ def _era(h, pole, row_steps, column_steps, order, full):
     return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
+@compiled
 def _singular_values(h, row_steps, column_steps, candidates):
     operator = hankel_operator(h, row_steps, column_steps, 1)
     return leading_values(operator, candidates)

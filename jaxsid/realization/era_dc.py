@@ -1,7 +1,5 @@
 """The eigensystem realization algorithm with data correlations (ERA/DC)."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import laguerre_to_shift
 from jaxsid.realization.era import LARGEST_CANDIDATE, balanced, factor, named_factors
 from jaxsid.realization.hankel import Operator, hankel_matrix, hankel_operator
@@ -185,7 +184,7 @@ def _operator(h: Array, g: Array, steps: _Shape, full: bool):
     return CorrelationOperator(near, hankel_operator(g, far_rows, far_columns, 1 + steps.first_lag), steps)
 
 
-@partial(jax.jit, static_argnums=(2, 3, 4))
+@compiled
 def _era_dc(h, pole, steps, order, full):
     change = _operator(h, jnp.diff(h, axis=0), steps, False)
     operator = _operator(h, h, steps, full)
@@ -197,6 +196,6 @@ def _era_dc(h, pole, steps, order, full):
     return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
 
 
-@partial(jax.jit, static_argnums=(1, 2))
+@compiled
 def _singular_values(h, steps, candidates):
     return leading_values(_operator(h, h, steps, False), candidates)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.records import Indicators, Realization
 
 FADED = 0.05  # part of its first amplitude below which a mode has nothing left to compare
@@ -49,6 +50,7 @@ def mode_indicators(
     return Indicators(_coherence(inputs, lam_w, rz.column_steps), msv, emac, mpc, emac * mpc)
 
 
+@compiled
 def phase_collinearity(shapes: Complex[Array, "outputs n"]) -> Float[Array, " n"]:
     """(2 l_max / (l_1 + l_2) - 1)^2, l the eigenvalues of the covariance of real and imaginary parts.
 

@@ -13,16 +13,16 @@ whose variables separate", SIAM J. Numer. Anal. 10 (1973), with L. Kaufman's sim
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jaxsid.impulse.lines import Lines, laguerre_pole, laguerre_shift
+from jaxsid.compilation import compiled
+from jaxsid.impulse.lines import Lines, laguerre_shift
 from jaxsid.least_squares import forward, levenberg_marquardt
 from jaxsid.realization.era import era
-from jaxsid.records import ImpulseResponse, Realization
+from jaxsid.records import ImpulseResponse, Realization, as_array
 
 STEPS = 30
 EDGE = 1.001  # largest size of a pole in the Laguerre shift: room for a rigid body in noise
@@ -58,13 +58,14 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
         lines: in-band lines of the records.
         rounds: how often the noise spectrum is estimated anew and the fit repeated.
     """
-    pole = jnp.asarray(laguerre_pole(float(lines.band[1]), float(lines.dt)))
-    theta = jnp.asarray(_denominators(np.asarray(realization.A), float(pole), float(_least(lines, pole))))
+    pole = lines.pole
+    least = as_array(np.asarray(_least(lines)))
+    theta = as_array(_denominators(np.asarray(realization.A), float(pole), float(least)))
     noise = _first_noise(lines)
     for _ in range(rounds + 1):
-        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole)
+        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole, least)
     samples = max(4 * len(theta) + 2, 200)
-    h = _markov_parameters(theta, response[:, : lines.u.shape[1]], samples)
+    h = _markov_parameters(theta, response, lines.u.shape[1], samples)
     ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="polished in band")
     refined = era(ir, order=len(theta), rows=samples // 2 - 1, cols=samples // 2 - 1)
     return Polished(refined, noise, residual, transient, theta, covariance)
@@ -89,9 +90,9 @@ def _mirrored(w: np.ndarray) -> np.ndarray:
     return w / np.maximum(np.abs(w), 1.0) ** 2
 
 
-def _least(lines: Lines, pole: Array) -> Array:
+def _least(lines: Lines) -> float:
     """The least real pole: gone after a sample for held inputs, any for band-limited ones."""
-    return -jnp.ones(()) if "band" in lines.hold else laguerre_shift(jnp.asarray(FASTEST), pole)
+    return -1.0 if "band" in lines.hold else float(laguerre_shift(np.asarray(FASTEST), float(lines.pole)))
 
 
 def _possible(theta: Array, least: Array) -> Array:
@@ -161,18 +162,17 @@ def _solve(design: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]
     return q, triangle, x / scale
 
 
-@eqx.filter_jit
+@compiled
 def _first_noise(lines: Lines) -> Array:
     """The same level for all lines of an output, as long as nothing is known."""
     power = (jnp.abs(lines.y) ** 2 * lines.weight).sum(axis=0) / jnp.maximum(lines.weight.sum(axis=0), 1.0)
     return jnp.broadcast_to(jnp.sqrt(power), lines.y.shape)
 
 
-@eqx.filter_jit
-def _fit(lines: Lines, theta: Array, noise: Array, pole: Array) -> tuple[Array, ...]:
+@compiled
+def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, least: Array) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
-    least = _least(lines, pole)
     both = forward(lambda t: _projected_residual(t, args))
 
     def evaluate(t: Array) -> tuple[Array, Array]:
@@ -206,9 +206,10 @@ def _level(x: Array, weight: Array) -> Array:
     return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
 
 
-@eqx.filter_jit
-def _markov_parameters(theta: Array, response: Array, samples: int) -> Array:
+@compiled
+def _markov_parameters(theta: Array, response: Array, inputs: int, samples: int) -> Array:
     """Markov parameters in the shift w of the partial fractions, (samples, outputs, inputs)."""
+    response = response[:, :inputs]
     pairs = len(theta) // 2
     a1, a2 = theta[: 2 * pairs].reshape(pairs, 2).T
 

@@ -11,12 +11,12 @@ T. McKelvey, H. Akcay, L. Ljung, "Subspace-based multivariable system identifica
 response data", IEEE Trans. Automatic Control 41 (1996).
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.checks import require
+from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.records import Realization
 
@@ -47,7 +47,7 @@ def refit_inputs(realization: Realization, lines: Lines) -> Realization:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _refit(
     A: Float[Array, "n n"], C: Float[Array, "m n"], lines: Lines
 ) -> tuple[Float[Array, "n r"], Float[Array, "m r"]]:

@@ -1,21 +1,20 @@
 """Which poles stay where they are as the order of the model grows."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxsid.checks import is_concrete, require
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import check_holds
 from jaxsid.realization.era import balanced, factor
 from jaxsid.realization.hankel import hankel_operator
 from jaxsid.realization.indicators import phase_collinearity
 from jaxsid.realization.window import check_method, check_order, check_response, check_steps, era_window
-from jaxsid.records import ImpulseResponse
+from jaxsid.records import ImpulseResponse, as_array
 
 
 class Stabilization(NamedTuple):
@@ -97,7 +96,7 @@ def stabilization(
     return _diagram(orders, models, tolerances, np.asarray(values))
 
 
-@partial(jax.jit, static_argnums=(2, 3, 4, 5))
+@compiled
 def _largest(h, pole, row_steps, column_steps, order, full) -> tuple[Array, Array, Array]:
     """Balanced A and C of the largest order, in the shift of h; those of a smaller one are their corners."""
     operator = hankel_operator(h, row_steps, column_steps, 1, full)
@@ -150,7 +149,7 @@ def _diagram(
     poles = np.concatenate([m[0] for m in models])
     shapes = np.concatenate([m[1] for m in models])
     order = np.repeat(orders, [len(m[0]) for m in models])
-    mpc = np.asarray(phase_collinearity(jnp.asarray(shapes.T)))
+    mpc = np.asarray(phase_collinearity(as_array(shapes.T)))
     frequency, damping, shape = agree.T
     return Stabilization(
         order, poles, np.abs(poles), _damping(poles), mpc, shapes, frequency, damping, shape, values

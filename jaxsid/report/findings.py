@@ -31,7 +31,7 @@ def _cards(found: Identification) -> tuple[Card, ...]:
     worst = _worst(found)
     fit = "no fit was computed"
     if worst is not None:
-        floor = float(found.noise_floor[worst])
+        floor = float(np.asarray(found.noise_floor)[worst])
         fit = f"{found.outputs[worst]}; noise alone leaves {percent(floor)}"
     largest = MISSING if worst is None else percent(float(found.train_nrmse[worst]))
     seen = [mode.frequency for mode in modes if not mode.real]

@@ -31,7 +31,12 @@ def time_figure(found: Identification, output: str, record: int = 0) -> Figure:
     for ax in axes[:2, 0]:
         scaled(ax, "y", text, size)
     legend(axes[0, 0], 2)
-    _residual(axes[2, 0], time, measured - modelled, float(found.noise_floor[column] * np.nanstd(measured)))
+    _residual(
+        axes[2, 0],
+        time,
+        measured - modelled,
+        float(np.asarray(found.noise_floor)[column] * np.nanstd(measured)),
+    )
     scaled(
         axes[2, 0], "y", "residual\n" + text[text.index("(") :], float(np.nanmax(np.abs(measured - modelled)))
     )
