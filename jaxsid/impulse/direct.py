@@ -9,10 +9,8 @@ the
   noise seen in the record so little that the answer is good;
 - regularized: Bayesian estimate with a prior that says how smooth an impulse response is and how it decays,
 the
-  DC kernel and its second-order kin (T. Chen, H. Ohlsson, L. Ljung, Automatica 48 (2012) 1525-1535), solved
-  in a
-  Krylov
-  space. The feedthrough is free: an accelerometer's is a spike that no smooth prior would allow.
+  DC kernel and its second-order kin (T. Chen, H. Ohlsson, L. Ljung, Automatica 48 (2012) 1525-1535), solved in a
+  Krylov space. The feedthrough is free: an accelerometer's is a spike that no smooth prior would allow.
 """
 
 from collections.abc import Callable, Sequence
@@ -113,9 +111,8 @@ class Direct(eqx.Module):
 def smooth_prior(theta: Array, z: Float[Array, "taps inputs"]) -> Float[Array, "taps inputs"]:
     """z, white, to a response that is free at 0, then smooth, and decays.
 
-    For k > 0: h_k = exp(-k / decay) sum_(j >= k) f_(j-k) z_j, f_i = exp(-i / length) for order 1 (the DC
-    kernel),
-    (1 + i) exp(-i / length) for order 2. The filter runs backwards, so that the first taps have full size.
+    For k > 0: h_k = exp(-k / decay) sum_(j >= k) f_(j-k) z_j, f_i = exp(-i / length) for order 1 (the DC kernel), (1
+    + i) exp(-i / length) for order 2. The filter runs backwards, so that the first taps have full size.
     """
     order, correlation, decay = theta
     m = z.shape[0] - 1

@@ -1,9 +1,8 @@
 """The orthonormal discrete wavelet transform with periodic extension, any depth, along the first axis.
 
-Mallat's pyramid: a_(j+1)[k] = sum_i g[i] a_j[2k + i + shift], d_(j+1)[k] = sum_i f[i] a_j[2k + i + shift],
-indices
-modulo the length, g and f the scaling and wavelet filters. It agrees with PyWavelets' mode "periodization".
-S. Mallat, A Wavelet Tour of Signal Processing, chapter 7; the filters are those of PyWavelets.
+Mallat's pyramid: a_(j+1)[k] = sum_i g[i] a_j[2k + i + shift], d_(j+1)[k] = sum_i f[i] a_j[2k + i + shift], indices
+modulo the length, g and f the scaling and wavelet filters. It agrees with PyWavelets' mode "periodization". S.
+Mallat, A Wavelet Tour of Signal Processing, chapter 7; the filters are those of PyWavelets.
 """
 
 from functools import lru_cache

@@ -1,17 +1,13 @@
 """Ensemble averaging in the wavelet domain, in the two ways of the thesis [2.33-2.39].
 
 products      [2.33-2.35]: average y U_DWT' and U_DWT U_DWT' over the records, then solve once.
-correlations  [2.36-2.39]: average the correlations y U' and U U' themselves, then transform them along their
-lags and
-              solve R_yu = h_DWT (W R_uu).
+correlations  [2.36-2.39]: average the correlations y U' and U U' themselves, then transform them along their lags
+              and solve R_yu = h_DWT (W R_uu).
 
-With every coefficient kept both are the time-domain estimate sum(y U') (sum U U')^-1, for any number of
-records, and
+With every coefficient kept both are the time-domain estimate sum(y U') (sum U U')^-1, for any number of records, and
 differ by rounding only; with coefficients dropped, products minimizes the output error over the subspace,
-correlations
-the error of the correlations. Normal equations square the condition number: directions below the square root
-of the
-rounding error are lost, which `Wavelet` and `Direct` do not lose.
+correlations the error of the correlations. Normal equations square the condition number: directions below the square
+root of the rounding error are lost, which `Wavelet` and `Direct` do not lose.
 """
 
 from collections.abc import Sequence

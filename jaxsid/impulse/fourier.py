@@ -15,10 +15,9 @@ from jaxsid.records import ImpulseResponse, Record
 class Fourier(eqx.Module):
     """H1, H2 or Hv by averaged spectra, then the inverse FFT: h[0] is the feedthrough.
 
-    The response must have decayed within a segment, or it wraps around (a window hides that as damping). With
-    a periodic excitation give `periods`: whole periods are averaged without a window, and there is no
-    leakage once
-    the transient has died.
+    The response must have decayed within a segment, or it wraps around (a window hides that as damping). With a
+    periodic excitation give `periods`: whole periods are averaged without a window, and there is no leakage once the
+    transient has died.
 
     Attributes:
         estimator: "h1" (noise on outputs), "h2" (on inputs) or "hv" (on both).

@@ -1,11 +1,9 @@
 """Regularized least squares with an operator that is only applied: y = A z + noise, z ~ N(0, tau^2 I).
 
-Golub-Kahan bidiagonalization A V = U B projects the problem once; every strength of the regularization is
-then a
-small problem in B. The strength is the one that maximizes the marginal likelihood of y at a known noise
-level.
-Sources: D. O'Leary and J. Simmons, SIAM J. Sci. Stat. Comput. 2 (1981) 474-489; for the likelihood,
-G. Pillonetto et al., Automatica 50 (2014) 657-682.
+Golub-Kahan bidiagonalization A V = U B projects the problem once; every strength of the regularization is then a
+small problem in B. The strength is the one that maximizes the marginal likelihood of y at a known noise level.
+Sources: D. O'Leary and J. Simmons, SIAM J. Sci. Stat. Comput. 2 (1981) 474-489; for the likelihood, G. Pillonetto et
+al., Automatica 50 (2014) 657-682.
 """
 
 from collections.abc import Callable
@@ -82,9 +80,8 @@ def trace_quadrature(
 ) -> Quadrature:
     """Stochastic Lanczos quadrature from one random sign vector (S. Ubaru, J. Chen, Y. Saad, SIMAX 38, 2017).
 
-    The bidiagonalization from y knows the singular values that y excites but not how many there are of each,
-    and
-    so would count too few parameters; a random start counts them.
+    The bidiagonalization from y knows the singular values that y excites but not how many there are of each, and so
+    would count too few parameters; a random start counts them.
     """
     probe = jax.random.rademacher(key, mask.shape, z.dtype) * mask
     _, B, _ = bidiagonalize(forward, probe, z, steps)

@@ -133,6 +133,33 @@ def record_lines(
         InputError: malformed records, differing inputs or holds.
         InsufficientDataError: too few lines in the band.
     """
+    _check_together(records)
+    names = tuple(dict.fromkeys(n for r in records for n in r.outputs)) if outputs is None else tuple(outputs)
+    used = _usable(band, records)
+    dt = float(max(records, key=lambda r: r.u.shape[0]).dt)
+    parts = [_one_record(r, names, used, dt) for r in records]
+    counts = [len(p[0]) for p in parts]
+    if min(counts) < 8:
+        raise InsufficientDataError(
+            f"{records[int(np.argmin(counts))].name}: only {min(counts)} spectral lines between {used[0]:.3g} and "
+            f"{used[1]:.3g} Hz: the record is too short for this band."
+        )
+    owner = np.repeat(np.eye(len(records)), counts, axis=0)
+    lines = [*(np.concatenate(column) for column in zip(*parts, strict=True)), owner]
+    padding = _bucket(sum(counts)) - sum(counts)
+    z, omega, u, y, weight, owner = (np.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)) for a in lines)
+    z[sum(counts) :], omega[sum(counts) :] = z[0], omega[0]  # padding must not hit a pole
+    return Lines(
+        *jax.device_put((z, omega, u, y, weight, owner, np.asarray(dt))),
+        record_dt=tuple(float(r.dt) for r in records),
+        samples=tuple(r.u.shape[0] for r in records),
+        band=jax.device_put(np.asarray(used, float)),
+        hold=records[0].hold,
+    )
+
+
+def _check_together(records: Sequence[Record]) -> None:
+    """Raise where the records are malformed, excite nothing, or differ in inputs or holds."""
     for r in records:
         check_record(r)
         require(
@@ -145,44 +172,20 @@ def record_lines(
     )
     if len(records) == 1:
         check_excitation(records[0])
-    names = (
-        tuple(outputs) if outputs is not None else tuple(dict.fromkeys(n for r in records for n in r.outputs))
-    )
-    require(
-        band is not None or all(is_concrete(r.u, r.dt) for r in records),
-        "name the band when the records are traced",
-    )
+
+
+def _usable(band: tuple[float, float] | None, records: Sequence[Record]) -> tuple[float, float]:
+    """The band asked for, or the one that the inputs excite."""
     if band is None:
-        band = excited_band(records)
-    else:
-        nyquist = min(0.5 / float(r.dt) for r in records)
-        require(
-            0 <= band[0] < band[1] and band[0] < nyquist,
-            f"band {band[0]:g} to {band[1]:g} Hz cannot be used: name the lower end first, below {nyquist:g} Hz, which "
-            "is half the sampling rate.",
-        )
-    dt = float(max(records, key=lambda r: r.u.shape[0]).dt)
-    parts = [_one_record(r, names, band, dt) for r in records]
-    lines = [np.concatenate([p[i] for p in parts]) for i in range(5)]
-    counts = [len(p[0]) for p in parts]
-    if min(counts) < 8:
-        raise InsufficientDataError(
-            f"{records[int(np.argmin(counts))].name}: only {min(counts)} spectral lines between {band[0]:.3g} and "
-            f"{band[1]:.3g} Hz: the record is too short for this band."
-        )
-    owner = np.repeat(np.eye(len(records)), counts, axis=0)
-    padding = _bucket(sum(counts)) - sum(counts)
-    z, omega, u, y, weight = (np.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)) for a in lines)
-    z[sum(counts) :], omega[sum(counts) :] = z[0], omega[0]  # padding must not hit a pole
-    owner = np.pad(owner, [(0, padding), (0, 0)])
-    parts = jax.device_put((z, omega, u, y, weight, owner, np.asarray(dt)))
-    return Lines(
-        *parts,
-        record_dt=tuple(float(r.dt) for r in records),
-        samples=tuple(r.u.shape[0] for r in records),
-        band=jax.device_put(np.asarray(band, float)),
-        hold=records[0].hold,
+        require(all(is_concrete(r.u, r.dt) for r in records), "name the band when the records are traced")
+        return excited_band(records)
+    nyquist = min(0.5 / float(r.dt) for r in records)
+    require(
+        0 <= band[0] < band[1] and band[0] < nyquist,
+        f"band {band[0]:g} to {band[1]:g} Hz cannot be used: name the lower end first, below {nyquist:g} Hz, which "
+        "is half the sampling rate.",
     )
+    return band
 
 
 def _one_record(

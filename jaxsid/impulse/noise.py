@@ -16,14 +16,12 @@ def noise_level(
 ) -> Float[Array, " outputs"]:
     """Standard deviation of what past outputs and inputs do not explain in each output.
 
-    The residual of the regression y_t = sum_(i=1)^p a_i y_(t-i) + sum_(i=0)^p b_i u_(t-i) + e_t, corrected
-    for the
-    number of its parameters. It is zero to rounding for a noise-free linear system of order up to p, and
-    close
-    to the noise where white noise is added to the output. Source: L. Ljung, System Identification, section
-    7.2.
+    The residual of the regression y_t = sum_(i=1)^p a_i y_(t-i) + sum_(i=0)^p b_i u_(t-i) + e_t, corrected for the
+    number of its parameters. It is zero to rounding for a noise-free linear system of order up to p, and close to the
+    noise where white noise is added to the output. Source: L. Ljung, System Identification, section 7.2.
     """
-    return jax.lax.stop_gradient(jax.vmap(_one_output, in_axes=(None, 2, None))(u, y, mask))
+    # one output after another: batched factorizations side by side can lock up the CPU's thread pool
+    return jax.lax.stop_gradient(jax.lax.map(lambda one: _one_output(u, one, mask), jnp.moveaxis(y, 2, 0)))
 
 
 def _one_output(u: Array, y: Array, mask: Array) -> Array:

@@ -43,8 +43,7 @@ def select_method(
 ) -> Selection:
     """The candidate that, fitted to the first part of each record, best predicts the last part.
 
-    The prediction is the response to the whole input history, y_t = sum_k h_k u_(t-k), taps beyond the
-    fitted part
+    The prediction is the response to the whole input history, y_t = sum_k h_k u_(t-k), taps beyond the fitted part
     being zero. Needs values: it does not work under `jit`.
 
     Args:

@@ -1,10 +1,9 @@
 """Averaged spectra of records, the frequency response and the coherences that follow from them.
 
-S_ab(f) = mean over segments of A(f) B(f)^H. H1 = S_yu S_uu^-1 (noise on the outputs), H2 = S_yy S_uy^-1
-(noise on the
-inputs; for other than as many outputs as inputs, output by output from the total output spectrum, see `h2`),
-Hv (noise on both: total least squares, output by output).
-Source: J. Bendat and A. Piersol, Random Data, 4th ed., chapters 6 and 7.
+S_ab(f) = mean over segments of A(f) B(f)^H. H1 = S_yu S_uu^-1 (noise on the outputs), H2 = S_yy S_uy^-1 (noise on the
+inputs; for other than as many outputs as inputs, output by output from the total output spectrum, see `h2`), Hv
+(noise on both: total least squares, output by output). Source: J. Bendat and A. Piersol, Random Data, 4th ed.,
+chapters 6 and 7.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.checks import require
 from jaxsid.compilation import compiled
 from jaxsid.impulse.protocol import as_records
-from jaxsid.records import Record
+from jaxsid.records import Record, as_array
 
 ESTIMATORS = ("h1", "h2", "hv")
 WINDOWS = ("boxcar", "hann", "hamming", "blackman", "flattop")
@@ -108,7 +107,7 @@ def spectra(
     w = window_samples(window, segment)
     z = [(r.u, r.y) for r in many]
     # With periods every record gives the same number of them; a remainder at the end is not used.
-    tables = [segments(segment * periods if periods else len(u), segment, overlap) for u, _ in z]
+    tables = [as_array(segments(segment * periods if periods else len(u), segment, overlap)) for u, _ in z]
     return _averaged(
         z,
         tables,
@@ -123,7 +122,7 @@ def spectra(
 @compiled
 def _averaged(
     z: list[tuple[Array, Array]],
-    tables: list[np.ndarray],
+    tables: list[Array],
     w: Array,
     dt: Array,
     *,

@@ -1,13 +1,10 @@
 """Impulse response through its wavelet coefficients.
 
-With U[tau, t] = u(t - tau) and W the orthonormal transform along tau, y = h U = (h W') (W U) = h_DWT U_DWT.
-At full
-length and depth that is a change of coordinates: the least-squares solution is the time-domain one. What the
-basis
-buys is a subspace: keep the coarse coefficients only, or expect the fine ones to be small. The feedthrough
-is an
-unknown of its own beside the wavelet coefficients of the taps 1, 2, ..., because an accelerometer's is a
-spike that no coarse subspace holds, and left out it would spoil every tap after it.
+With U[tau, t] = u(t - tau) and W the orthonormal transform along tau, y = h U = (h W') (W U) = h_DWT U_DWT. At full
+length and depth that is a change of coordinates: the least-squares solution is the time-domain one. What the basis
+buys is a subspace: keep the coarse coefficients only, or expect the fine ones to be small. The feedthrough is an
+unknown of its own beside the wavelet coefficients of the taps 1, 2, ..., because an accelerometer's is a spike that
+no coarse subspace holds, and left out it would spoil every tap after it.
 """
 
 from collections.abc import Sequence
@@ -39,9 +36,8 @@ PRIORS = ((4.0, 0.1), (4.0, 0.3), (6.0, 0.1), (6.0, 0.3), (4.0, 1e6), (6.0, 1e6)
 class Wavelet(eqx.Module):
     """Least squares for the wavelet coefficients of the impulse response, records starting at rest.
 
-    The modelled length is the next length that the depth allows (a power of two for full depth); taps beyond
-    the record
-    are seen by no equation and are not returned.
+    The modelled length is the next length that the depth allows (a power of two for full depth); taps beyond the
+    record are seen by no equation and are not returned.
 
     Attributes:
         wavelet: an orthogonal wavelet by its PyWavelets name; "db4" has 8 coefficients and 4 vanishing

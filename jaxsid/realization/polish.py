@@ -92,7 +92,7 @@ def _mirrored(w: np.ndarray) -> np.ndarray:
 
 def _least(lines: Lines) -> float:
     """The least real pole: gone after a sample for held inputs, any for band-limited ones."""
-    return -1.0 if "band" in lines.hold else float(laguerre_shift(np.asarray(FASTEST), float(lines.pole)))
+    return -1.0 if "band" in lines.hold else float(laguerre_shift(np.array([FASTEST]), float(lines.pole))[0])
 
 
 def _possible(theta: Array, least: Array) -> Array:
