@@ -7,7 +7,7 @@ from band_limited import DT, band_noise, chain, poles, respond
 
 from jaxsid.impulse.lines import record_lines
 from jaxsid.realization.polish import _possible, polish
-from jaxsid.records import Realization, Record
+from jaxsid.records import Record
 
 SYSTEM = chain([1.2, 0.9], [3000, 2500], [1.5, 1.2])
 FAST = chain([1.2, 0.9], [3000, 2500], [1.5, 200.0])
@@ -23,15 +23,8 @@ def lines_of(system, noise, seed=0):
 
 
 def start(system, off):
-    """A realization whose poles are wrong by the factor off."""
-    z = np.exp(DT * poles(system) * off)
-    blocks = np.zeros((4, 4))
-    pairs, real = z[z.imag > 0], np.sort(z[z.imag == 0].real)
-    for i, p in enumerate(pairs):
-        blocks[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[p.real, p.imag], [-p.imag, p.real]]
-    for i, p in enumerate(real, 2 * len(pairs)):
-        blocks[i, i] = p
-    return Realization(blocks, np.ones((4, 1)), np.ones((2, 4)), np.zeros((2, 1)), DT)
+    """Poles that are wrong by the factor off."""
+    return np.exp(DT * poles(system) * off)
 
 
 def found_poles(polished):

@@ -13,16 +13,19 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.checks import InsufficientDataError, check_excitation, check_record, is_concrete, require
+from jaxsid.compilation import compiled
 from jaxsid.records import Record
 
 # Excited means: smoothed input power within this ratio of its largest value.
 EXCITED = 1 / 400
 FEWEST_LINES = 12  # with power; a tone has up to six
 # The band is spread over this part of the circle of the Laguerre shift, so that regressions in it are well posed.
+NEIGHBOURS = 24  # lines on either side over which a level is averaged
 BAND_ANGLE = 0.8 * np.pi
 Points = TypeVar("Points", Array, np.ndarray)
 
@@ -72,6 +75,28 @@ def laguerre_pole(band_end: float, dt: float) -> float:
     """The pole a in [0, 1) that spreads 0 to band_end (Hz) over most of the unit circle of w."""
     stretch = np.tan(BAND_ANGLE / 2) / np.tan(min(np.pi * band_end * dt, 0.499 * np.pi))
     return float(max((stretch - 1) / (stretch + 1), 0.0))
+
+
+@compiled
+def line_level(
+    x: Complex[Array, "lines outputs"], weight: Float[Array, "lines outputs"]
+) -> Float[Array, "lines outputs"]:
+    """Root of the mean square of lines over their neighbours of the same output, never below 1e-12 of the largest.
+
+    Args:
+        x: one value a line and output.
+        weight: 1 where it was measured, else 0.
+    """
+    count = len(x)
+    low = jnp.maximum(jnp.arange(count) - NEIGHBOURS, 0)
+    high = jnp.minimum(jnp.arange(count) + NEIGHBOURS + 1, count)
+
+    def average(v: Array) -> Array:
+        total = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(v, axis=0)])
+        return total[high] - total[low]
+
+    power = average(jnp.abs(x) ** 2 * weight) / jnp.maximum(average(weight), 1.0)
+    return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
 
 
 def excited_band(records: Sequence[Record]) -> tuple[float, float]:

@@ -15,7 +15,6 @@ from jaxsid.pipeline.matrices import POOR, Found, find_matrices
 from jaxsid.pipeline.modes import FinalModes, final_modes
 from jaxsid.pipeline.setting import Setting, setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
-from jaxsid.realization.stabilization import Stabilization, stabilization
 from jaxsid.records import Record, SecondOrderModel, as_array
 
 LONGEST_RESPONSE = 8192  # samples of the impulse response that is reported
@@ -74,7 +73,7 @@ def identify(
         find_matrices(model, system, space) if len(space.raw.A) == system.visible else _not_this_order(system)
     )
     explained = found.fit is not None and float(found.fit.misfit) < POOR
-    say("modes, stabilization, fit")
+    say("modes, fit")
     final = final_modes(space, found.model if explained else None, found.fit if explained else None)
     return _collect(model, records, system, space, found, final, initial == "rest")
 
@@ -101,7 +100,7 @@ def _collect(
         continuous=final.continuous,
         order=len(space.raw.A),
         order_reason=space.order_reason,
-        stabilization=_stabilization(space, system.visible),
+        stabilization=space.stabilization,
         modal=final.modal,
         frequency_std=final.frequency_std,
         damping_ratio_std=final.damping_ratio_std,
@@ -157,13 +156,6 @@ def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedMod
 
 def _response_samples(records: Sequence[Record]) -> int:
     return min(max(r.u.shape[0] for r in records), LONGEST_RESPONSE)
-
-
-def _stabilization(space: StateSpace, expected: int) -> Stabilization:
-    """Orders up to twice the expected one and some, from the window of the impulse response."""
-    half = (space.response.h.shape[0] - 1) // 2
-    most = min(2 * expected + 8, half)
-    return stabilization(space.response, tuple(range(2, most + 1)), rows=half, cols=half)
 
 
 def _about_records(records: Sequence[Record], lines: Lines) -> tuple[str, ...]:

@@ -11,9 +11,11 @@ from jaxsid.impulse.inband import observer_response
 from jaxsid.impulse.lines import Lines
 from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.mechanics.hold import continuous, discretise
+from jaxsid.realization.elimination import needed_poles
 from jaxsid.realization.era import era
 from jaxsid.realization.era_dc import era_dc
 from jaxsid.realization.polish import Polished, polish
+from jaxsid.realization.stabilization import Stabilization, stabilization
 from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record, as_array
 
 # Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
@@ -38,6 +40,7 @@ class StateSpace(NamedTuple):
     polished: Polished
     model: ContinuousModel
     lines: Lines
+    stabilization: Stabilization
     order_reason: str
     warnings: tuple[str, ...]
 
@@ -72,7 +75,9 @@ def state_space(
     order_used = expected if order is None else order
     raw = _realize(response, order_used, realization)
     reason = _reason(raw, order, expected)
-    polished = polish(raw, lines)
+    diagram = _diagram(response, max(expected, order_used))
+    candidates = [np.linalg.eigvals(np.asarray(raw.A)), _larger(diagram, 2 * order_used, response)]
+    polished = polish(needed_poles(candidates, lines, order_used), lines)
     if not np.isfinite(polished.realization.A).all():
         raise InsufficientDataError(
             f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
@@ -80,13 +85,14 @@ def state_space(
         )
     if len(set(lines.record_dt)) > 1:
         lines = _common_rate(lines, polished.realization)
-        polished = polish(polished.realization, lines)
+        polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines)
     return StateSpace(
         response,
         raw,
         polished,
         continuous(polished.realization),
         lines,
+        diagram,
         reason,
         _warnings(polished.realization, max(r.u.shape[0] for r in records)),
     )
@@ -100,6 +106,21 @@ def _realize(response: ImpulseResponse, order: int, realization: str) -> Realiza
     return era_dc(
         response, order=order, rows=reach // 3, cols=reach - reach // 3 - LAGS, lags=LAGS, first_lag=1
     )
+
+
+def _diagram(response: ImpulseResponse, order: int) -> Stabilization:
+    """Orders up to twice the expected one and some, from the window of the impulse response."""
+    half = (response.h.shape[0] - 1) // 2
+    most = min(2 * order + 8, half)
+    return stabilization(response, tuple(range(2, most + 1)), rows=half, cols=half)
+
+
+def _larger(diagram: Stabilization, order: int, response: ImpulseResponse) -> np.ndarray:
+    """Poles z, with all conjugates, of the model of about that order in the diagram."""
+    s = diagram.pole[diagram.order == min(order, diagram.order.max())]
+    half = 0.5 * s * float(response.dt)
+    z = (1 + half) / (1 - half) if "band" in response.hold else np.exp(2 * half)
+    return np.concatenate([z, z[np.imag(s) > 0].conj()])
 
 
 def _reason(raw: Realization, order: int | None, expected: int) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
-from jaxsid.impulse.lines import Lines, laguerre_shift
+from jaxsid.impulse.lines import Lines, laguerre_shift, line_level
 from jaxsid.least_squares import forward, levenberg_marquardt
 from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, Realization, as_array
@@ -27,7 +27,6 @@ from jaxsid.records import ImpulseResponse, Realization, as_array
 STEPS = 30
 EDGE = 1.001  # largest size of a pole in the Laguerre shift: room for a rigid body in noise
 FASTEST = 0.01  # least real pole z: what is faster is gone after a sample, and below 0 it alternates in sign
-NEIGHBOURS = 24  # lines on either side over which the noise spectrum is averaged
 
 
 class Polished(NamedTuple):
@@ -50,17 +49,17 @@ class Polished(NamedTuple):
     pole_covariance: Float[Array, "n n"]
 
 
-def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polished:
+def polish(poles: Complex[np.ndarray, " n"], lines: Lines, *, rounds: int = 2) -> Polished:
     """A realization of the same order whose poles, residues and transients fit the lines best.
 
     Args:
-        realization: start; only its poles are used.
+        poles: z, with all conjugates, to start from.
         lines: in-band lines of the records.
         rounds: how often the noise spectrum is estimated anew and the fit repeated.
     """
     pole = lines.pole
     least = as_array(np.asarray(_least(lines)))
-    theta = as_array(_denominators(np.asarray(realization.A), float(pole), float(least)))
+    theta = as_array(_denominators(poles, float(pole), float(least)))
     noise = _first_noise(lines)
     for _ in range(rounds + 1):
         theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole, least)
@@ -71,9 +70,9 @@ def polish(realization: Realization, lines: Lines, *, rounds: int = 2) -> Polish
     return Polished(refined, noise, residual, transient, theta, covariance)
 
 
-def _denominators(A: np.ndarray, pole: float, least: float) -> np.ndarray:
+def _denominators(poles: np.ndarray, pole: float, least: float) -> np.ndarray:
     """Coefficients a_1, a_2 of each pole pair in the shift w, then the odd real pole if there is one."""
-    eigenvalues = laguerre_shift(np.linalg.eigvals(A), pole)
+    eigenvalues = laguerre_shift(np.asarray(poles, complex), pole)
     height = np.imag(eigenvalues)
     above = _mirrored(eigenvalues[height > 1e-12])
     real = _mirrored(np.real(eigenvalues[np.abs(height) <= 1e-12]))
@@ -189,21 +188,7 @@ def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, least: Array) ->
     response = response.reshape(-1, inputs + records, lines.y.shape[1])
     sections = _sections(theta, laguerre_shift(lines.z, pole))
     transient = jnp.einsum("ks,kr,srm->km", sections, lines.record, response[:, inputs:])
-    return theta, _level(residual, lines.weight), response, residual, transient, covariance
-
-
-def _level(x: Array, weight: Array) -> Array:
-    """Root of the mean square over the neighbouring lines, (lines, outputs), never below 1e-12 of the largest."""
-    count = len(x)
-    low = jnp.maximum(jnp.arange(count) - NEIGHBOURS, 0)
-    high = jnp.minimum(jnp.arange(count) + NEIGHBOURS + 1, count)
-
-    def average(v: Array) -> Array:
-        total = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(v, axis=0)])
-        return total[high] - total[low]
-
-    power = average(jnp.abs(x) ** 2 * weight) / jnp.maximum(average(weight), 1.0)
-    return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
+    return theta, line_level(residual, lines.weight), response, residual, transient, covariance
 
 
 @compiled
