@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from band_limited import (
     DT,
     SEVEN,
@@ -336,3 +337,52 @@ def test_what_cannot_be_used_is_told(model, noisy):
     tone = np.sin(2 * np.pi * 10 * np.arange(20000) * DT)[:, None]
     with pytest.raises(InsufficientDataError, match=r"band|frequenc"):
         identify(model, recorded(model, tone, respond(SYSTEM, tone)))
+
+
+def unstable_record(seed=0):
+    """A mass on a negative spring, held upright by feedback: force and noisy displacement, by scipy alone."""
+    rng = np.random.default_rng(seed)
+    A = np.array([[0.0, 1.0], [40.0, -0.5]])
+    step = scipy.linalg.expm(DT * np.block([[A, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]))
+    command, x = 20 * band_noise(rng, 12000, 1)[:, 0], np.zeros(2)
+    u, y = np.zeros((2, len(command)))
+    for k, r in enumerate(command):
+        y[k], u[k] = x[0], r - 100 * x[0] - 10 * x[1]
+        x = step[:2, :2] @ x + step[:2, 2] * u[k]
+    return u, y + 0.01 * y.std() * rng.standard_normal(len(y)), np.linalg.eigvals(A)
+
+
+def test_an_unstable_system_keeps_its_pole_and_is_said_to_be_unstable():
+    u, y, truth = unstable_record()
+    model = lumped_model(
+        ["b1"],
+        [1.3],
+        [50.0],
+        [0.3],
+        connections=[Connection("c1", ("ground", "b1"))],
+        inputs=[Input("f1", "b1")],
+        sensors=[Sensor("s1", "b1", "displacement")],
+    )
+    found = identify(model, recorded(model, u, y))
+    growing = truth[truth > 0][0]
+    assert np.abs(np.asarray(found.modal.poles) - growing).min() < 0.01 * growing
+    assert found.matrices is None
+    assert any("unstable" in w for w in found.warnings)
+    assert np.isnan(np.asarray(found.train_nrmse)).all()
+
+
+def test_a_hold_that_is_not_the_forces_is_noticed():
+    """Forces that go on between the samples: as if held they spoil the fit, which says so; "band" is exact."""
+    rng = np.random.default_rng(0)
+    system, often = chain(*THREE), 20
+    u = band_noise(rng, 12000 * often, 1, DT / often)
+    y = respond(system, u, DT / often)[::often]
+    y = y + 0.01 * y.std(axis=0) * rng.standard_normal(y.shape)
+    held, smooth = (
+        identify(m, recorded(m, u[::often], y, hold=hold))
+        for hold in ("zero", "band")
+        for m in (nominal(system, THREE, hold=hold),)
+    )
+    assert any("'band'" in w for w in held.warnings)
+    assert not any("'band'" in w for w in smooth.warnings)
+    check(smooth, system, USUAL)

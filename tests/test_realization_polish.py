@@ -68,7 +68,7 @@ def test_a_pole_beyond_the_band_stays_possible_in_noise(seed):
 
 
 def test_what_is_possible():
-    least = jnp.asarray(-0.8)
+    limits = jnp.asarray([-0.8, 1.001])
     pair = lambda p: [-2 * p.real, abs(p) ** 2]  # noqa: E731
     two = lambda a, b: [-(a + b), a * b]  # noqa: E731
     for theta, expected in (
@@ -83,4 +83,5 @@ def test_what_is_possible():
         ([*two(0.5, 0.2), -1.2], False),
         ([*two(0.5, 0.2), 0.9], False),
     ):
-        assert bool(_possible(jnp.array(theta), least)) is expected, theta
+        assert bool(_possible(jnp.array(theta), limits)) is expected, theta
+    assert bool(_possible(jnp.array(two(0.5, 1.2)), jnp.asarray([-0.8, jnp.inf])))

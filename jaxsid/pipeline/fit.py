@@ -60,6 +60,18 @@ def time_fit(
     return TimeFit(tuple(predictions), np.sqrt(left / size), np.sqrt(np.minimum(floor, left) / size))
 
 
+def no_time_fit(records: Sequence[Record], outputs: Sequence[str]) -> TimeFit:
+    """NaN everywhere: what is said of a system that no simulation can follow.
+
+    Args:
+        records: what was measured.
+        outputs: names of the model's outputs.
+    """
+    nothing = np.full(len(outputs), np.nan)
+    empty = tuple(as_array(np.full((len(r.y), len(outputs)), np.nan)) for r in records)
+    return TimeFit(empty, nothing, nothing)
+
+
 def _prediction(model: ContinuousModel, record: Record, y: np.ndarray, at_rest: bool) -> Array:
     """All outputs, from the initial state that fits the measured ones, NaN elsewhere in y."""
     sampled = discretise(model, record.dt, hold=record.hold)

@@ -10,7 +10,7 @@ from jaxsid.impulse.lines import Lines, record_lines
 from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.mechanics.lumped import LumpedModel, Matrices, lumped_model
 from jaxsid.mechanics.simulate import markov_parameters
-from jaxsid.pipeline.fit import frequency_fits, time_fit
+from jaxsid.pipeline.fit import frequency_fits, no_time_fit, time_fit
 from jaxsid.pipeline.matrices import POOR, Found, find_matrices
 from jaxsid.pipeline.modes import FinalModes, final_modes
 from jaxsid.pipeline.setting import Setting, setting
@@ -69,9 +69,10 @@ def identify(
         records, lines, order=order, expected=system.visible, realization=realization, method=method
     )
     say("mass, damping and stiffness")
-    found = (
-        find_matrices(model, system, space) if len(space.raw.A) == system.visible else _not_this_order(system)
-    )
+    if len(space.raw.A) != system.visible:
+        found = _not_this_order(system)
+    else:
+        found = find_matrices(model, system, space) if space.stable else Found(None, None, None, ())
     explained = found.fit is not None and float(found.fit.misfit) < POOR
     say("modes, fit")
     final = final_modes(space, found.model if explained else None, found.fit if explained else None)
@@ -89,7 +90,11 @@ def _collect(
 ) -> Identification:
     """The stages' results in one value, with the comparison in time and in frequency."""
     lines = space.lines
-    times = time_fit(final.continuous, records, system.outputs, lines, space.polished.noise, at_rest)
+    times = (
+        time_fit(final.continuous, records, system.outputs, lines, space.polished.noise, at_rest)
+        if space.stable
+        else no_time_fit(records, system.outputs)
+    )
     return Identification(
         nominal=model,
         records=records,

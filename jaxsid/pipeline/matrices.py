@@ -209,6 +209,7 @@ def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[
     elif float(fit.misfit) > POOR:
         notes.append(
             f"Mass, damping and stiffness leave {float(fit.misfit):.3g} times the residual of the state-space model: "
-            "the structure (bodies, places, kinds or gains of sensors) does not match the system in this band."
+            "the structure (bodies, places, kinds or gains of sensors) or the hold of the inputs ('band' for forces "
+            "that were measured while they varied, not set step by step) does not match the system in this band."
         )
     return tuple(notes)

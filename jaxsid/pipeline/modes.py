@@ -54,7 +54,7 @@ def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: Matri
     else:
         realization = _minimal(matrices, space)
         model = continuous(realization)
-    measured, own = modal(space.raw), modal(realization)
+    measured, own = modal(space.measured), modal(realization)
     indicators = _nearest(measured, own)
     own = eqx.tree_at(lambda m: m.indicators, own, indicators, is_leaf=lambda x: x is None)
     if matrices is None or fit is None:

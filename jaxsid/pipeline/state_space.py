@@ -20,6 +20,8 @@ from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
 
 # Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
 LAGS = 5
+CLEARLY = 0.1  # less noise, in logarithm, before a growing pole is believed
+GROWTH = 1e4  # over a record, beyond which a pole is unstable and not a free body's in noise
 
 
 class StateSpace(NamedTuple):
@@ -28,20 +30,24 @@ class StateSpace(NamedTuple):
     Attributes:
         response: estimated impulse response.
         raw: realization of that response.
+        measured: realization of that response, of a higher order where `raw` misses a pole that the lines need.
         polished: refined against the lines, with noise and residual.
         model: the refined realization in continuous time.
         lines: the lines, all brought to the common sampling interval.
         order_reason: in words.
+        stable: False where a pole grows too fast for noise.
         warnings: what went less than well.
     """
 
     response: ImpulseResponse
     raw: Realization
+    measured: Realization
     polished: Polished
     model: ContinuousModel
     lines: Lines
     stabilization: Stabilization
     order_reason: str
+    stable: bool
     warnings: tuple[str, ...]
 
 
@@ -77,7 +83,12 @@ def state_space(
     reason = _reason(raw, order, expected)
     diagram = _diagram(response, max(expected, order_used))
     candidates = [np.linalg.eigvals(np.asarray(raw.A)), _larger(diagram, 2 * order_used, response)]
+    growing, stable = _growing(candidates, lines), True
     polished = polish(needed_poles(candidates, lines, order_used), lines)
+    if len(growing) > 0:
+        free = polish(needed_poles(candidates, lines, order_used, stable=False), lines, stable=False)
+        if _noise_gain(polished, free, lines) > CLEARLY:
+            polished, stable = free, False
     if not np.isfinite(polished.realization.A).all():
         raise InsufficientDataError(
             f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
@@ -85,16 +96,21 @@ def state_space(
         )
     if len(set(lines.record_dt)) > 1:
         lines = _common_rate(lines, polished.realization)
-        polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines)
+        polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines, stable=stable)
+    measured = raw
+    if not _holds(raw, polished.realization):
+        measured = _realize(response, min(2 * order_used, int(diagram.order.max())), realization)
     return StateSpace(
         response,
         raw,
+        measured,
         polished,
         continuous(polished.realization),
         lines,
         diagram,
         reason,
-        _warnings(polished.realization, max(r.u.shape[0] for r in records)),
+        stable,
+        () if stable else _unstable(growing),
     )
 
 
@@ -113,6 +129,12 @@ def _diagram(response: ImpulseResponse, order: int) -> Stabilization:
     half = (response.h.shape[0] - 1) // 2
     most = min(2 * order + 8, half)
     return stabilization(response, tuple(range(2, most + 1)), rows=half, cols=half)
+
+
+def _holds(found: Realization, wanted: Realization) -> bool:
+    """Whether every pole that is wanted lies within a tenth of its size, in continuous time, of one found."""
+    s, near = (np.log(np.linalg.eigvals(np.asarray(x.A)).astype(complex)) for x in (wanted, found))
+    return bool((np.abs(s[:, None] - near).min(axis=1) < 0.1 * np.abs(s) + 1e-9).all())
 
 
 def _larger(diagram: Stabilization, order: int, response: ImpulseResponse) -> np.ndarray:
@@ -138,14 +160,31 @@ def _reason(raw: Realization, order: int | None, expected: int) -> str:
     )
 
 
-def _warnings(found: Realization, samples: int) -> tuple[str, ...]:
-    """Poles that grow over the record; the pole of a free body lies at 1, give or take noise."""
-    growing = np.abs(np.linalg.eigvals(np.asarray(found.A))).max()
-    if samples * np.log(growing) > 1:
-        return (
-            f"A pole is unstable (abs(z) = {growing:.6g}): a free body, active feedback, or too high an order.",
-        )
-    return ()
+def _growing(candidates: Sequence[np.ndarray], lines: Lines) -> np.ndarray:
+    """Poles (1/s) within the band that grow by more than GROWTH over the longest record, at either order.
+
+    Noise makes poles grow too, but hardly so much, and others at another order; the pole of a free body lies at
+    zero, give or take noise.
+    """
+    s, again = (np.log(z.astype(complex)) / float(lines.dt) for z in candidates)
+    longest = max(n * dt for n, dt in zip(lines.samples, lines.record_dt, strict=True))
+    inside = np.abs(s) < 2 * np.pi * float(np.asarray(lines.band)[1])
+    twice = np.abs(s[:, None] - again).min(axis=1) < 0.05 * np.abs(s)
+    return s[inside & twice & (s.real * longest > np.log(GROWTH)) & (s.imag >= 0)]
+
+
+def _noise_gain(one: Polished, other: Polished, lines: Lines) -> float:
+    """By how much the other fit leaves less noise, mean logarithm over lines and outputs."""
+    used = np.asarray(lines.weight) > 0
+    return float(np.mean((np.log(np.asarray(one.noise)) - np.log(np.asarray(other.noise)))[used]))
+
+
+def _unstable(poles: np.ndarray) -> tuple[str, ...]:
+    told = ", ".join(f"{p.real:.4g} +- {p.imag:.4g}j" if p.imag else f"{p.real:.4g}" for p in poles)
+    return (
+        f"The system is unstable (poles at {told} 1/s): active feedback, negative stiffness, or wrong signs. No "
+        "passive mass, damping and stiffness have these poles, and no simulation can follow the records for long.",
+    )
 
 
 def _common_rate(lines: Lines, found: Realization) -> Lines:

@@ -38,7 +38,9 @@ class _Equations(NamedTuple):
     weight: np.ndarray
 
 
-def needed_poles(candidates: Sequence[np.ndarray], lines: Lines, order: int) -> np.ndarray:
+def needed_poles(
+    candidates: Sequence[np.ndarray], lines: Lines, order: int, *, stable: bool = True
+) -> np.ndarray:
     """The `order` poles that explain the lines best, of each set of candidates in turn.
 
     Args:
@@ -46,12 +48,14 @@ def needed_poles(candidates: Sequence[np.ndarray], lines: Lines, order: int) -> 
             the others do no better; larger ones are thinned out.
         lines: in-band lines of the records.
         order: number of poles wanted.
+        stable: mirror poles outside of the unit circle into it.
 
     Returns:
         (order,) poles z.
     """
     pole = float(lines.pole)
-    sets = [_units(laguerre_shift(np.asarray(z, complex), pole)) for z in candidates]
+    shifted = [laguerre_shift(np.asarray(z, complex), pole) for z in candidates]
+    sets = [_units(mirrored(w) if stable else w) for w in shifted]
     drive = np.concatenate([np.asarray(lines.u), np.asarray(lines.record)], axis=1)
     y, used = np.asarray(lines.y), np.asarray(lines.weight)
     plain = np.sqrt((np.abs(y) ** 2 * used).sum(axis=0) / np.maximum(used.sum(axis=0), 1.0))
@@ -66,10 +70,15 @@ def needed_poles(candidates: Sequence[np.ndarray], lines: Lines, order: int) -> 
     return (w + pole) / (1 + pole * w)
 
 
+def mirrored(w: np.ndarray) -> np.ndarray:
+    """Poles outside of the unit circle, which only noise puts there in a passive system, mirrored into it."""
+    return w / np.maximum(np.abs(w), 1.0) ** 2
+
+
 def _units(w: np.ndarray) -> list[complex]:
-    """One of each pair, and the real ones, mirrored into the circle: noise alone puts them outside."""
-    inside: list[complex] = (w / np.maximum(np.abs(w), 1.0) ** 2).tolist()
-    return [complex(p.real) if abs(p.imag) <= REAL else p for p in inside if p.imag > -REAL]
+    """One of each pair, and the real ones."""
+    every: list[complex] = w.tolist()
+    return [complex(p.real) if abs(p.imag) <= REAL else p for p in every if p.imag > -REAL]
 
 
 def _states(units: Sequence[complex]) -> int:

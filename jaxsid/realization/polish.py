@@ -21,11 +21,14 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines, laguerre_shift, line_level
 from jaxsid.least_squares import forward, levenberg_marquardt
+from jaxsid.realization.elimination import mirrored
 from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, Realization, as_array
 
 STEPS = 30
 EDGE = 1.001  # largest size of a pole in the Laguerre shift: room for a rigid body in noise
+LONGEST = 200  # Markov parameters of the refined model
+HIDING = 1e3  # growth within the Markov parameters that leaves the other modes their digits
 FASTEST = 0.01  # least real pole z: what is faster is gone after a sample, and below 0 it alternates in sign
 
 
@@ -49,33 +52,45 @@ class Polished(NamedTuple):
     pole_covariance: Float[Array, "n n"]
 
 
-def polish(poles: Complex[np.ndarray, " n"], lines: Lines, *, rounds: int = 2) -> Polished:
+def polish(
+    poles: Complex[np.ndarray, " n"], lines: Lines, *, stable: bool = True, rounds: int = 2
+) -> Polished:
     """A realization of the same order whose poles, residues and transients fit the lines best.
 
     Args:
         poles: z, with all conjugates, to start from.
         lines: in-band lines of the records.
+        stable: keep every pole inside the unit circle, where noise alone might put it outside.
         rounds: how often the noise spectrum is estimated anew and the fit repeated.
     """
     pole = lines.pole
-    least = as_array(np.asarray(_least(lines)))
-    theta = as_array(_denominators(poles, float(pole), float(least)))
+    least = _least(lines)
+    limits = as_array(np.array([least, EDGE if stable else np.inf]))
+    theta = as_array(_denominators(poles, float(pole), float(least), stable))
     noise = _first_noise(lines)
     for _ in range(rounds + 1):
-        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole, least)
-    samples = max(4 * len(theta) + 2, 200)
+        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole, limits)
+    samples = max(4 * len(theta) + 2, _samples(np.asarray(theta)))
     h = _markov_parameters(theta, response, lines.u.shape[1], samples)
     ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="polished in band")
     refined = era(ir, order=len(theta), rows=samples // 2 - 1, cols=samples // 2 - 1)
     return Polished(refined, noise, residual, transient, theta, covariance)
 
 
-def _denominators(poles: np.ndarray, pole: float, least: float) -> np.ndarray:
+def _samples(theta: np.ndarray) -> int:
+    """Markov parameters that show the slowest mode, fewer where a pole outside of the circle would hide the rest."""
+    pairs = len(theta) // 2
+    roots = [np.roots([1.0, *theta[2 * i : 2 * i + 2]]) for i in range(pairs)] + [-theta[2 * pairs :]]
+    growth = np.log(max(np.abs(np.concatenate(roots)).max(), 1.0))
+    return int(min(LONGEST, np.log(HIDING) / growth)) if growth > 0 else LONGEST
+
+
+def _denominators(poles: np.ndarray, pole: float, least: float, stable: bool) -> np.ndarray:
     """Coefficients a_1, a_2 of each pole pair in the shift w, then the odd real pole if there is one."""
     eigenvalues = laguerre_shift(np.asarray(poles, complex), pole)
+    eigenvalues = mirrored(eigenvalues) if stable else eigenvalues
     height = np.imag(eigenvalues)
-    above = _mirrored(eigenvalues[height > 1e-12])
-    real = _mirrored(np.real(eigenvalues[np.abs(height) <= 1e-12]))
+    above, real = eigenvalues[height > 1e-12], np.real(eigenvalues[np.abs(height) <= 1e-12])
     real = list(np.sort(np.maximum(real, 0.9 * least)))
     pairs = [(-2 * p.real, abs(p) ** 2) for p in above]
     while len(real) > 1:  # slowest with fastest, so that no pair starts as a double pole
@@ -84,31 +99,27 @@ def _denominators(poles: np.ndarray, pole: float, least: float) -> np.ndarray:
     return np.concatenate([np.ravel(pairs), [-p for p in real]])
 
 
-def _mirrored(w: np.ndarray) -> np.ndarray:
-    """Poles outside of the unit circle, which only noise puts there, mirrored into it."""
-    return w / np.maximum(np.abs(w), 1.0) ** 2
-
-
 def _least(lines: Lines) -> float:
     """The least real pole: gone after a sample for held inputs, any for band-limited ones."""
     return -1.0 if "band" in lines.hold else float(laguerre_shift(np.array([FASTEST]), float(lines.pole))[0])
 
 
-def _possible(theta: Array, least: Array) -> Array:
+def _possible(theta: Array, limits: Array) -> Array:
     """Whether a passive system, sampled, can have these poles: none grows, no real one alternates in sign.
 
     Poles elsewhere may fit the lines of a band as well.
 
     Args:
         theta: denominators.
-        least: the least real pole, in the Laguerre shift.
+        limits: the least real pole and the largest size of any, in the Laguerre shift.
     """
+    least, edge = limits
     pairs = len(theta) // 2
     a1, a2 = theta[: 2 * pairs].reshape(pairs, 2).T
     single = -theta[2 * pairs :]
-    stable = (a2 < EDGE**2) & (jnp.abs(a1) < EDGE + a2 / EDGE)
+    stable = (a2 < edge**2) & (jnp.abs(a1) < edge + a2 / edge)
     steady = (a1**2 < 4 * a2) | ((least**2 + a1 * least + a2 > 0) & (-a1 / 2 > least))
-    return (stable & steady).all() & ((jnp.abs(single) < EDGE) & (single > least)).all()
+    return (stable & steady).all() & ((jnp.abs(single) < edge) & (single > least)).all()
 
 
 def _sections(theta: Array, w: Array) -> Array:
@@ -169,14 +180,14 @@ def _first_noise(lines: Lines) -> Array:
 
 
 @compiled
-def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, least: Array) -> tuple[Array, ...]:
+def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, limits: Array) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
     both = forward(lambda t: _projected_residual(t, args))
 
     def evaluate(t: Array) -> tuple[Array, Array]:
         residual, jacobian = both(t)
-        return jnp.where(_possible(t, least), residual, jnp.inf), jacobian
+        return jnp.where(_possible(t, limits), residual, jnp.inf), jacobian
 
     found = levenberg_marquardt(evaluate, theta, max_steps=STEPS)
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)

@@ -38,7 +38,10 @@ def time_figure(found: Identification, output: str, record: int = 0) -> Figure:
         float(np.asarray(found.noise_floor)[column] * np.nanstd(measured)),
     )
     scaled(
-        axes[2, 0], "y", "residual\n" + text[text.index("(") :], float(np.nanmax(np.abs(measured - modelled)))
+        axes[2, 0],
+        "y",
+        "residual\n" + text[text.index("(") :],
+        float(np.nanmax(np.abs(measured - modelled), initial=0.0)),
     )
     label(axes[2, 0], "time (s)")
     return figure
