@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from jaxsid.checks import InputError as InputError
     from jaxsid.checks import InsufficientDataError as InsufficientDataError
     from jaxsid.checks import JaxsidError as JaxsidError
+    from jaxsid.compilation import keep_programs as keep_programs
     from jaxsid.files.model_toml import read_model as read_model
     from jaxsid.files.model_toml import write_model as write_model
     from jaxsid.files.record_file import read_record as read_record
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from jaxsid.impulse.estimate import impulse_response as impulse_response
     from jaxsid.impulse.fourier import Fourier as Fourier
     from jaxsid.impulse.inband import InBand as InBand
+    from jaxsid.impulse.lines import record_lines as record_lines
     from jaxsid.impulse.select import select_method as select_method
     from jaxsid.impulse.spectra import coherence as coherence
     from jaxsid.impulse.spectra import frequency_response as frequency_response
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
     from jaxsid.realization.era import era as era
     from jaxsid.realization.era_dc import era_dc as era_dc
     from jaxsid.realization.order import select_order as select_order
+    from jaxsid.realization.polish import polish as polish
+    from jaxsid.realization.refit import refit_inputs as refit_inputs
     from jaxsid.realization.stabilization import stabilization as stabilization
     from jaxsid.records import ContinuousModel as ContinuousModel
     from jaxsid.records import ImpulseResponse as ImpulseResponse
@@ -52,6 +56,7 @@ if TYPE_CHECKING:
 # Where each public name lives. Names are imported when first used, so that `import jaxsid` stays light.
 _HOMES = {
     "jaxsid.checks": ("InputError", "InsufficientDataError", "JaxsidError"),
+    "jaxsid.compilation": ("keep_programs",),
     "jaxsid.files.model_toml": ("read_model", "write_model"),
     "jaxsid.files.record_file": ("read_record", "read_records"),
     "jaxsid.identification": ("Identification",),
@@ -61,6 +66,7 @@ _HOMES = {
     "jaxsid.impulse.estimate": ("impulse_response",),
     "jaxsid.impulse.fourier": ("Fourier",),
     "jaxsid.impulse.inband": ("InBand",),
+    "jaxsid.impulse.lines": ("record_lines",),
     "jaxsid.impulse.select": ("select_method",),
     "jaxsid.impulse.spectra": ("coherence", "frequency_response"),
     "jaxsid.impulse.wavelet": ("Wavelet",),
@@ -79,6 +85,8 @@ _HOMES = {
     "jaxsid.realization.era": ("era",),
     "jaxsid.realization.era_dc": ("era_dc",),
     "jaxsid.realization.order": ("select_order",),
+    "jaxsid.realization.polish": ("polish",),
+    "jaxsid.realization.refit": ("refit_inputs",),
     "jaxsid.realization.stabilization": ("stabilization",),
     "jaxsid.records": (
         "ContinuousModel",

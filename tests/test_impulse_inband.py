@@ -8,9 +8,13 @@ from scipy import signal
 
 from jaxsid.checks import InputError, InsufficientDataError
 from jaxsid.impulse.inband import InBand, observer_response, output_groups
+from jaxsid.impulse.laguerre import time_samples
 from jaxsid.impulse.lines import excited_band, laguerre_pole, laguerre_shift, record_lines
+from jaxsid.impulse.select import select_method
+from jaxsid.mechanics.hold import shift_to_laguerre
+from jaxsid.mechanics.recursion import markov
 from jaxsid.realization.era import era
-from jaxsid.records import Record
+from jaxsid.records import ImpulseResponse, Record
 
 SYSTEM = chain([1.2, 0.9], [3000, 2500], [1.5, 1.2])
 
@@ -108,3 +112,29 @@ def test_what_cannot_be_used_is_told(record):
         record_lines([tone])
     with pytest.raises(InputError, match="differ from those"):
         record_lines([record, Record(record.u, record.y, DT, inputs=["other"])])
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.85, 0.93])
+def test_time_samples_of_a_laguerre_response(pole):
+    """A system's own Markov parameters, by scipy, come out of its expansion in the Laguerre shift."""
+    system = chain([1.2, 0.9], [3000, 2500], [15.0, 12.0], driven=(0, 1))
+    a, b, c, d, _ = signal.cont2discrete(state_space(system), DT)
+    shifted = shift_to_laguerre(*(jnp.asarray(x) for x in (a, b, c, d)), pole)
+    count = {0.0: 1500, 0.85: 700, 0.93: 400}[pole]
+    h = markov(*shifted, count)
+    truth = np.stack([d, *(c @ np.linalg.matrix_power(a, k) @ b for k in range(1499))])
+    got = time_samples(ImpulseResponse(h, DT, pole=pole), 1500)
+    np.testing.assert_allclose(got, truth, atol=1e-9 * np.abs(truth).max())
+    with pytest.raises(InputError, match="band"):
+        time_samples(ImpulseResponse(h, DT, pole=pole, hold="band"), 1500)
+
+
+def test_selection_takes_the_observer_for_a_band_limited_force():
+    rng = np.random.default_rng(4)
+    system = chain([1.2, 0.9], [3000, 2500], [1.5, 1.2])
+    u = band_noise(rng, 6000, 1)
+    y = respond(system, u)
+    record = Record(u, y + 0.02 * y.std(axis=0) * rng.standard_normal(y.shape), DT)
+    found = select_method(record)
+    assert isinstance(found.method, InBand)
+    assert float(found.scores[0]) < 0.05

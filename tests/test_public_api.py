@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from pathlib import Path
 
 import pytest
 
@@ -32,3 +33,12 @@ def test_documented(name):
     assert doc, f"{name} has no docstring"
     missing = [argument for argument in arguments(thing) if not re.search(rf"\b{re.escape(argument)}\b", doc)]
     assert not missing, f"the docstring of {name} does not mention {missing}"
+
+
+def test_the_stages_of_the_readme_run_as_printed(capsys: pytest.CaptureFixture[str]):
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    (stages,) = (block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "era(" in block)
+    exec(stages, names := {})
+    assert names["so"].mass.shape == (3, 3)
+    assert abs(float(names["so"].stiffness[2, 2]) - 22) < 1e-3
+    assert "1.3776" in capsys.readouterr().out

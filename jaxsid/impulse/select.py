@@ -11,12 +11,14 @@ from jaxsid.checks import require
 from jaxsid.compilation import compiled
 from jaxsid.impulse.direct import Direct
 from jaxsid.impulse.fourier import Fourier
+from jaxsid.impulse.inband import InBand
+from jaxsid.impulse.laguerre import time_samples
 from jaxsid.impulse.protocol import ImpulseMethod, as_records, stack
 from jaxsid.impulse.toeplitz import simulate
 from jaxsid.impulse.wavelet import Wavelet
-from jaxsid.records import ImpulseResponse, Record
+from jaxsid.records import Record
 
-CANDIDATES: tuple[ImpulseMethod, ...] = (Direct(), Wavelet(), Wavelet(keep=64), Fourier())
+CANDIDATES: tuple[ImpulseMethod, ...] = (InBand(), Direct(), Wavelet(), Wavelet(keep=64), Fourier())
 # Scores this close (relative) count as equal; the earlier candidate is then kept.
 TIE = 1.02
 
@@ -48,21 +50,21 @@ def select_method(
 
     Args:
         records: a Record or several of the same channels and rate.
-        candidates: estimators; None tries the time domain, wavelets with all and with few coefficients,
-        Fourier.
+        candidates: estimators; None tries the observer in the excited band (not with hold "band"), the time domain,
+            wavelets with all and with few coefficients, Fourier.
         held_out: share of each record that is kept from the fit, 0 to 1.
 
     Raises InputError where the records or the share cannot be used, or no candidate suits the records.
     """
     many = as_records(records)
-    tried = CANDIDATES if candidates is None else tuple(candidates)
+    tried = _usual(many) if candidates is None else tuple(candidates)
     require(len(tried) > 0, "select_method: no candidates were given.")
     require(0 < held_out < 1, f"held_out must be between 0 and 1, not {held_out}.")
     cuts = tuple(int(r.u.shape[0] * (1 - held_out)) for r in many)
     require(min(cuts) >= 8, "the records are too short to hold samples out; choose the method yourself.")
     first = [_head(r, cut) for r, cut in zip(many, cuts, strict=True)]
     # One length for all candidates, so that the simulation compiles once.
-    responses = [_padded(method(first, None), max(cuts)) for method in tried]
+    responses = [time_samples(method(first, None), max(cuts)) for method in tried]
     ensemble = stack(many)
     unseen = jnp.stack([jnp.arange(ensemble.u.shape[1]) >= cut for cut in cuts]) * ensemble.mask
     scores = np.array([float(_score(ensemble.u, ensemble.y, unseen, h)) for h in responses])
@@ -77,10 +79,10 @@ def _head(record: Record, cut: int) -> Record:
     return eqx.tree_at(lambda r: (r.u, r.y), record, (record.u[:cut], record.y[:cut]))
 
 
-def _padded(ir: ImpulseResponse, length: int) -> Array:
-    """Ordinary time taps, zero after the last."""
-    require(float(ir.pole) == 0, "select_method compares ordinary impulse responses, not Laguerre ones.")
-    return jnp.pad(ir.h, ((0, max(length - ir.h.shape[0], 0)), (0, 0), (0, 0)))[:length]
+def _usual(records: Sequence[Record]) -> tuple[ImpulseMethod, ...]:
+    """Without the one whose response has no time samples with hold "band"."""
+    band = any("band" in r.hold for r in records)
+    return tuple(c for c in CANDIDATES if not (band and isinstance(c, InBand)))
 
 
 @compiled
