@@ -1,22 +1,21 @@
 """Ordinary samples of an impulse response that is given in the Laguerre shift."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import require
 from jaxsid.compilation import compiled
-from jaxsid.mechanics.hold import laguerre_to_shift
-from jaxsid.mechanics.recursion import markov
+from jaxsid.impulse.lines import laguerre_shift
 from jaxsid.records import ImpulseResponse, as_array
-
-compiled_markov = compiled(markov)
 
 
 def time_samples(ir: ImpulseResponse, samples: int) -> Float[Array, "samples outputs inputs"]:
-    """Markov parameters in z of G(z) = sum_k h_k w^-k, w = (z - a) / (1 - a z): h_0, then sum_k h_k g_k(t).
+    """Markov parameters in z of G(z) = sum_k h_k w^-k, w = (z - a) / (1 - a z), by values of G on a circle.
 
-    g_k is the impulse response of w^-k, an all-pass: the k-th state of a chain of delays in w.
+    The impulse response of w^-k dies soon after its delay of k (1 + a) / (1 - a) samples; the circle has points
+    enough that nothing wraps around.
 
     Args:
         ir: in the Laguerre shift, or ordinary already.
@@ -29,12 +28,18 @@ def time_samples(ir: ImpulseResponse, samples: int) -> Float[Array, "samples out
         "band" not in ir.hold,
         "with hold 'band' an impulse response in the Laguerre shift has no time samples.",
     )
-    if float(ir.pole) == 0:
+    pole = float(ir.pole)
+    if pole == 0:
         return jnp.pad(ir.h, ((0, max(samples - len(ir.h), 0)), (0, 0), (0, 0)))[:samples]
-    count = len(ir.h) - 1
-    delays, first, zero = np.eye(count, k=-1), np.eye(count, 1), np.zeros((count, 1))
-    A, B, C, D = (as_array(x.astype(ir.h.dtype)) for x in (delays, first, np.eye(count), zero))
-    A, B, C, D = laguerre_to_shift(A, B, C, D, ir.pole)
-    g = compiled_markov(A, B, C, D, samples)[..., 0]
-    h = jnp.einsum("tk,kmr->tmr", g, ir.h[1:])
-    return h.at[0].add(ir.h[0])
+    delay = len(ir.h) * (1 + abs(pole)) / (1 - abs(pole))
+    points = 1 << int(np.ceil(np.log2(max(samples, 2 * delay))))
+    z = np.exp(2j * np.pi * np.arange(points // 2 + 1) / points)
+    return _on_circle(ir.h, as_array(1 / laguerre_shift(z, pole)), points)[:samples]
+
+
+@compiled
+def _on_circle(h: Array, back: Array, points: int) -> Array:
+    """Horner's rule in 1/w, then back from the circle."""
+    start = jnp.zeros((len(back), *h.shape[1:]), back.dtype)
+    G = jax.lax.scan(lambda sum_, h_k: (sum_ * back[:, None, None] + h_k, None), start, h[::-1])[0]
+    return jnp.fft.irfft(G, points, axis=0)

@@ -13,12 +13,14 @@ from jaxsid.impulse.direct import Direct
 from jaxsid.impulse.fourier import Fourier
 from jaxsid.impulse.inband import InBand
 from jaxsid.impulse.laguerre import time_samples
+from jaxsid.impulse.lines import record_lines
 from jaxsid.impulse.protocol import ImpulseMethod, as_records, stack
 from jaxsid.impulse.toeplitz import simulate
 from jaxsid.impulse.wavelet import Wavelet
 from jaxsid.records import Record
 
 CANDIDATES: tuple[ImpulseMethod, ...] = (InBand(), Direct(), Wavelet(), Wavelet(keep=64), Fourier())
+MOST_LAGUERRE = 4000
 # Scores this close (relative) count as equal; the earlier candidate is then kept.
 TIE = 1.02
 
@@ -64,7 +66,7 @@ def select_method(
     require(min(cuts) >= 8, "the records are too short to hold samples out; choose the method yourself.")
     first = [_head(r, cut) for r, cut in zip(many, cuts, strict=True)]
     # One length for all candidates, so that the simulation compiles once.
-    responses = [time_samples(method(first, None), max(cuts)) for method in tried]
+    responses = [time_samples(method(first, _samples(method, first)), max(cuts)) for method in tried]
     ensemble = stack(many)
     unseen = jnp.stack([jnp.arange(ensemble.u.shape[1]) >= cut for cut in cuts]) * ensemble.mask
     scores = np.array([float(_score(ensemble.u, ensemble.y, unseen, h)) for h in responses])
@@ -77,6 +79,14 @@ def select_method(
 
 def _head(record: Record, cut: int) -> Record:
     return eqx.tree_at(lambda r: (r.u, r.y), record, (record.u[:cut], record.y[:cut]))
+
+
+def _samples(method: ImpulseMethod, records: Sequence[Record]) -> int | None:
+    """None for the method's own choice; in the Laguerre shift as many as delay by the longest record."""
+    if not isinstance(method, InBand):
+        return None
+    pole = float(record_lines(records, band=method.band).pole)
+    return max(200, min(MOST_LAGUERRE, int(max(r.u.shape[0] for r in records) * (1 - pole) / (1 + pole))))
 
 
 def _usual(records: Sequence[Record]) -> tuple[ImpulseMethod, ...]:
