@@ -99,3 +99,16 @@ def check_excitation(record: Record) -> None:
                 "factor, so their effects cannot be told apart. Drive them independently, one after another, or "
                 "drop one."
             )
+
+
+def check_sensors(record: Record) -> None:
+    """Raise InputError where an output is constant, as that of a sensor that is dead or not connected."""
+    if not is_concrete(record.y):
+        return
+    y = np.asarray(record.y, dtype=float)
+    for name, column in zip(record.outputs, y.T, strict=True):
+        if np.ptp(column) <= 1e-14 * np.abs(column).max():
+            bad_input(
+                f"{record.name}: sensor '{name}' reads {column[0]:.6g} throughout: it is dead, not connected, or "
+                "saturated. Leave its column out."
+            )

@@ -185,6 +185,8 @@ def damaged(columns, name):
             c["force"] *= 0
         case "constant":
             c["force"] = 0 * c["force"] + 2.5
+        case "dead":
+            c["s2"] = 0 * c["s2"] + 0.3
         case "short":
             c = {k: v[:40] for k, v in c.items()}
         case "tone":
@@ -205,6 +207,7 @@ def damaged(columns, name):
         ("nan", 2, ("record.csv", "'s2'", "row")),
         ("zero", 2, ("record.csv", "'force'", "zero")),
         ("constant", 2, ("record.csv", "'force'", "constant")),
+        ("dead", 2, ("record.csv", "'s2'", "dead")),
         ("short", 3, ("40 samples", "6 states")),
         ("tone", 3, ("record.csv", "band")),
     ],

@@ -17,7 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jaxsid.checks import InsufficientDataError, check_excitation, check_record, is_concrete, require
+from jaxsid.checks import (
+    InsufficientDataError,
+    check_excitation,
+    check_record,
+    check_sensors,
+    is_concrete,
+    require,
+)
 from jaxsid.compilation import compiled
 from jaxsid.records import Record
 
@@ -184,9 +191,10 @@ def record_lines(
 
 
 def _check_together(records: Sequence[Record]) -> None:
-    """Raise where the records are malformed, excite nothing, or differ in inputs or holds."""
+    """Raise where the records are malformed, excite or show nothing, or differ in inputs or holds."""
     for r in records:
         check_record(r)
+        check_sensors(r)
         require(
             r.inputs == records[0].inputs and r.hold == records[0].hold,
             f"{r.name}: its inputs {r.inputs} or holds differ from those of {records[0].name}",

@@ -59,11 +59,11 @@ def needed_poles(
     drive = np.concatenate([np.asarray(lines.u), np.asarray(lines.record)], axis=1)
     y, used = np.asarray(lines.y), np.asarray(lines.weight)
     plain = np.sqrt((np.abs(y) ** 2 * used).sum(axis=0) / np.maximum(used.sum(axis=0), 1.0))
-    equations = _Equations(
-        laguerre_shift(np.asarray(lines.z), pole), drive, y, used / np.where(plain > 0, plain, 1.0)
-    )
+    plain = np.where(plain > 0, plain, 1.0)
+    equations = _Equations(laguerre_shift(np.asarray(lines.z), pole), drive, y, used / plain)
     left = _residual(equations, max(sets, key=_states))
-    equations = equations._replace(weight=used / np.asarray(line_level(as_array(left), as_array(used))))
+    noise = np.maximum(line_level(as_array(left), as_array(used)), RIDGE * plain)
+    equations = equations._replace(weight=used / noise)
     found = [_thinned(equations, units, order) for units in sets]
     costs = [_cost(_triangles(equations, units)) if _states(units) == order else np.inf for units in found]
     w = np.array([p for u in found[int(np.argmin(costs))] for p in ([u, u.conjugate()] if u.imag else [u])])
