@@ -9,7 +9,7 @@ the columns j adds x_j' C_jj^-1 x_j. Source: backward elimination, N. Draper and
 3rd ed., ch. 15.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ def needed_poles(
     plain = np.sqrt((np.abs(y) ** 2 * used).sum(axis=0) / np.maximum(used.sum(axis=0), 1.0))
     plain = np.where(plain > 0, plain, 1.0)
     equations = _Equations(laguerre_shift(np.asarray(lines.z), pole), drive, y, used / plain)
-    left = _residual(equations, max(sets, key=_states))
+    left = plain * _residual(equations, max(sets, key=_states))
     noise = np.maximum(line_level(as_array(left), as_array(used)), RIDGE * plain)
     equations = equations._replace(weight=used / noise)
     found = [_thinned(equations, units, order) for units in sets]
@@ -100,17 +100,19 @@ def _real(x: np.ndarray) -> np.ndarray:
     return np.concatenate([np.real(x), np.imag(x)])
 
 
-def _triangles(equations: _Equations, units: Sequence[complex]) -> list[np.ndarray]:
-    """For each output the triangle of [columns, y], columns of unit norm and ridged."""
+def _tables(equations: _Equations, units: Sequence[complex]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each output the weighted columns, of unit norm and ridged, and the weighted lines."""
     columns = _columns(equations, units)
-    result = []
     for y, weight in zip(equations.y.T, equations.weight.T, strict=True):
         table = _real(columns * weight[:, None])
         size = np.linalg.norm(table, axis=0)
         table = np.concatenate([table / np.where(size > 0, size, 1.0), RIDGE * np.eye(table.shape[1])])
-        target = np.concatenate([_real(y * weight), np.zeros(table.shape[1])])
-        result.append(_triangle(np.column_stack([table, target])))
-    return result
+        yield table, np.concatenate([_real(y * weight), np.zeros(table.shape[1])])
+
+
+def _triangles(equations: _Equations, units: Sequence[complex]) -> list[np.ndarray]:
+    """For each output the triangle of its table and lines."""
+    return [_triangle(np.column_stack(pair)) for pair in _tables(equations, units)]
 
 
 def _triangle(x: np.ndarray) -> np.ndarray:
@@ -122,16 +124,13 @@ def _cost(triangles: Sequence[np.ndarray]) -> float:
 
 
 def _residual(equations: _Equations, units: Sequence[complex]) -> np.ndarray:
-    """What the poles leave of each line, (lines, outputs)."""
-    columns = _columns(equations, units)
-    left = np.zeros_like(equations.y)
-    for i, (y, weight) in enumerate(zip(equations.y.T, equations.weight.T, strict=True)):
-        table = columns * weight[:, None]
-        size = np.linalg.norm(table, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        x = np.linalg.lstsq(_real(table / size), _real(y * weight), rcond=RIDGE)[0] / size
-        left[:, i] = (y - columns @ x) * (weight > 0)
-    return left
+    """What the poles leave of each line, in units of its weight, (lines, outputs)."""
+    left, count = [], len(equations.y)
+    for table, target in _tables(equations, units):
+        q = np.linalg.qr(table)[0]
+        rest = target - q @ (q.T @ target)
+        left.append(rest[:count] + 1j * rest[count : 2 * count])
+    return np.stack(left, axis=1)
 
 
 def _thinned(equations: _Equations, units: list[complex], order: int) -> list[complex]:
