@@ -52,6 +52,12 @@ if TYPE_CHECKING:
     from jaxsid.records import Realization as Realization
     from jaxsid.records import Record as Record
     from jaxsid.records import SecondOrderModel as SecondOrderModel
+    from jaxsid.uncertainty.ensemble import ensemble as ensemble
+    from jaxsid.uncertainty.noise import CorrelatedNoise as CorrelatedNoise
+    from jaxsid.uncertainty.noise import IndependentNoise as IndependentNoise
+    from jaxsid.uncertainty.noise import StationaryNoise as StationaryNoise
+    from jaxsid.uncertainty.propagate import propagate as propagate
+    from jaxsid.uncertainty.propagate import propagate_response as propagate_response
 
 # Where each public name lives. Names are imported when first used, so that `import jaxsid` stays light.
 _HOMES = {
@@ -96,6 +102,9 @@ _HOMES = {
         "Record",
         "SecondOrderModel",
     ),
+    "jaxsid.uncertainty.ensemble": ("ensemble",),
+    "jaxsid.uncertainty.noise": ("CorrelatedNoise", "IndependentNoise", "StationaryNoise"),
+    "jaxsid.uncertainty.propagate": ("propagate", "propagate_response"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
