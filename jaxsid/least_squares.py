@@ -49,7 +49,7 @@ def levenberg_marquardt(
     start: Float[Array, " n"],
     *,
     max_steps: int | Array,
-    tolerance: float = 1e-10,
+    tolerance: float | Array = 1e-10,
 ) -> Minimum:
     """The unknowns that minimize half a sum of squares, by Levenberg and Marquardt.
 

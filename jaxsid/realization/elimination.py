@@ -127,8 +127,8 @@ def _residual(equations: _Equations, units: Sequence[complex]) -> np.ndarray:
     """What the poles leave of each line, in units of its weight, (lines, outputs)."""
     left, count = [], len(equations.y)
     for table, target in _tables(equations, units):
-        q = np.linalg.qr(table)[0]
-        rest = target - q @ (q.T @ target)
+        triangle = _triangle(np.column_stack([table, target]))
+        rest = target - table @ np.linalg.solve(triangle[:-1, :-1], triangle[:-1, -1])
         left.append(rest[:count] + 1j * rest[count : 2 * count])
     return np.stack(left, axis=1)
 

@@ -26,6 +26,10 @@ from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, Realization, as_array
 
 STEPS = 30
+ROUGH, FINE = (
+    1e-5,
+    1e-10,
+)  # relative gain that ends a fit: while the noise spectrum is still a guess, and the last
 EDGE = 1.001  # largest size of a pole in the Laguerre shift: room for a rigid body in noise
 LONGEST = 200  # Markov parameters of the refined model
 HIDING = 1e3  # growth within the Markov parameters that leaves the other modes their digits
@@ -68,8 +72,11 @@ def polish(
     limits = as_array(np.array([least, EDGE if stable else np.inf]))
     theta = as_array(_denominators(poles, float(pole), float(least), stable))
     noise = _first_noise(lines)
-    for _ in range(rounds + 1):
-        theta, noise, response, residual, transient, covariance = _fit(lines, theta, noise, pole, limits)
+    for left in reversed(range(rounds + 1)):
+        tolerance = as_array(np.array(ROUGH if left else FINE))
+        theta, noise, response, residual, transient, covariance = _fit(
+            lines, theta, noise, pole, limits, tolerance
+        )
     samples = max(4 * len(theta) + 2, _samples(np.asarray(theta)))
     h = _markov_parameters(theta, response, lines.u.shape[1], samples)
     ir = ImpulseResponse(h, lines.dt, pole=pole, band=lines.band, hold=lines.hold, method="polished in band")
@@ -180,7 +187,9 @@ def _first_noise(lines: Lines) -> Array:
 
 
 @compiled
-def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, limits: Array) -> tuple[Array, ...]:
+def _fit(
+    lines: Lines, theta: Array, noise: Array, pole: Array, limits: Array, tolerance: Array
+) -> tuple[Array, ...]:
     """Poles for a given noise spectrum, then the linear coefficients, the residual and the new spectrum."""
     args = (lines, noise, pole)
     both = forward(lambda t: _projected_residual(t, args))
@@ -189,7 +198,7 @@ def _fit(lines: Lines, theta: Array, noise: Array, pole: Array, limits: Array) -
         residual, jacobian = both(t)
         return jnp.where(_possible(t, limits), residual, jnp.inf), jacobian
 
-    found = levenberg_marquardt(evaluate, theta, max_steps=STEPS)
+    found = levenberg_marquardt(evaluate, theta, max_steps=STEPS, tolerance=tolerance)
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
     design = _design(theta, lines, pole)
     weight = lines.weight / noise
