@@ -22,6 +22,7 @@ def test_frame_whose_floors_were_measured_one_after_another(data: Path):
     assert found.matrices is not None
     assert np.linalg.eigvalsh(np.asarray(found.matrices.mass))[0] > 0
     assert len(found.records) == 3
+    assert any("edge" in w for w in found.warnings)
 
 
 def test_free_axis_with_a_friction_that_the_model_lacks(data: Path):

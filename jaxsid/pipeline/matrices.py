@@ -15,6 +15,11 @@ from jaxsid.pipeline.state_space import StateSpace
 from jaxsid.records import SecondOrderModel, as_array
 
 GOOD = 1.5  # mean square residual, in units of the noise, that leaves nothing to look for
+AT_THE_EDGE = (
+    "The damping or stiffness that fits best is not that of a passive system: it was held at the edge of what is "
+    "possible, and the standard deviations do not cover that. Look for a sensor or input whose gain, sign, delay or "
+    "place is wrong, or for dynamics that the bodies do not have."
+)
 POOR = 3.0  # one that the user must hear of
 
 
@@ -39,8 +44,8 @@ def find_matrices(model: LumpedModel, system: Setting, space: StateSpace) -> Fou
     if system.one_a_body is None:
         return Found(None, None, None, (_too_few(model, system),))
     structured, trouble = _cbsi(system, space)
-    fit = _best_fit(model, system, space, sensed, structured)
-    notes = (*trouble, *_notes(fit, structured))
+    fit, held = _best_fit(model, system, space, sensed, structured)
+    notes = (*trouble, *_notes(fit, structured), *((AT_THE_EDGE,) if held else ()))
     if fit is None:
         return Found(structured, None, None, notes)
     matrices = dict(zip(("mass", "damping", "stiffness"), fit.matrices, strict=True))
@@ -110,23 +115,24 @@ def _best_fit(
     space: StateSpace,
     sensed: SecondOrderModel,
     structured: SecondOrderModel | None,
-) -> MatrixFit | None:
-    """The fit with the smallest misfit over the starts, tried in turn until one is good."""
+) -> tuple[MatrixFit | None, bool]:
+    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether it was held against its will."""
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     every, moving, strained = np.eye(len(model.bodies)), _complement(system.loose), _complement(system.rigid)
     complements = every, moving, strained
-    best = None
+    best, held = None, False
     for start in _starts(space, sensed, structured):
         sizes = entry_sizes(start, complements, _rate(space))
         for kind in (SymmetricMatrices, PositiveMatrices):
             parameters = kind(sizes, complements)
             fit = fit_matrices(target, parameters, start, sensed)
             if _positive(fit.matrices) and np.isfinite(fit.misfit):
-                best = fit if best is None or float(fit.misfit) < float(best.misfit) else best
+                if best is None or float(fit.misfit) < float(best.misfit):
+                    best, held = fit, kind is PositiveMatrices
                 break
         if best is not None and float(best.misfit) < GOOD:
             break
-    return best
+    return best, held and best is not None and float(best.misfit) > GOOD  # below that noise explains it
 
 
 def _complement(patterns: np.ndarray) -> np.ndarray:
