@@ -116,7 +116,7 @@ def _best_fit(
     sensed: SecondOrderModel,
     structured: SecondOrderModel | None,
 ) -> tuple[MatrixFit | None, bool]:
-    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether it was held against its will."""
+    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether the edge held it."""
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     every, moving, strained = np.eye(len(model.bodies)), _complement(system.loose), _complement(system.rigid)
     complements = every, moving, strained
