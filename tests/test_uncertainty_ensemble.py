@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +77,7 @@ def test_refuses():
         ensemble(lambda key: jnp.zeros(()), KEY, 0)
 
 
-def test_several_devices_give_the_same_bits():
+def test_several_devices_give_the_same_bits(tmp_path: Path):
     script = """
 import sys, jax
 jax.config.update("jax_enable_x64", True)
@@ -91,11 +92,10 @@ print(jax.device_count())
     results = []
     for devices in ("1", "4"):
         environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
-        path = os.path.join(os.environ.get("TMPDIR", "/tmp"), f"jaxsid-devices-{os.getpid()}-{devices}.npy")
+        path = str(tmp_path / f"{devices}.npy")
         done = subprocess.run(
             [sys.executable, "-c", script, folder, path], env=environment, capture_output=True, text=True
         )
         assert done.stdout.strip() == devices, done.stderr
         results.append(np.load(path))
-        os.remove(path)
     np.testing.assert_array_equal(results[0], results[1])
