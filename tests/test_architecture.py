@@ -21,6 +21,7 @@ LAYERS = (
     "checks",
     "least_squares",
     "mechanics",
+    "examples",
     "files",
     "impulse",
     "realization",
@@ -31,7 +32,6 @@ LAYERS = (
     "gap",
     "pipeline",
     "study",
-    "examples",
     "report",
     "demo",
     "cli",
@@ -52,6 +52,8 @@ HEAVY = (
     "pyuff",
     "jinja2",
     "zarr",
+    "pyarrow",
+    "distributed",
 )
 CORE = "jax, equinox, jaxtyping, optimistix, jaxopt, numpy, pywt"
 

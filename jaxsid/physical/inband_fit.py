@@ -49,7 +49,7 @@ class MatrixFit(NamedTuple):
         matrices: M, D, K.
         deviation: standard deviation of every entry.
         misfit: mean square of the weighted residual; 1 when the model explains all but noise.
-        covariance: of the unknowns.
+        covariance: of the unknowns, times the misfit where that is above 1.
         slopes: derivative of every entry of M, D, K to the unknowns, (N, N, p) each.
     """
 
@@ -129,14 +129,15 @@ def fit_matrices(
 
     found = levenberg_marquardt(evaluate, parameterization.unknowns(start), max_steps=STEPS)
     scale = jnp.sqrt(jnp.diag(found.jacobian_product))
+    free = (target.transient**2).sum() + len(found.value)
+    equations = 2 * (target.weight > 0).sum()
+    misfit = 2 * found.cost / jnp.maximum(equations - free, 1.0)
     covariance = jnp.linalg.inv(found.jacobian_product / scale / scale[:, None]) / scale / scale[:, None]
+    covariance = covariance * jnp.maximum(misfit, 1.0)
     slopes = jax.jacfwd(parameterization.matrices)(found.value)
     d_mass, d_damping, d_stiffness = (
         jnp.sqrt(jnp.maximum(jnp.einsum("ijp,pq,ijq->ij", x, covariance, x), 0.0)) for x in slopes
     )
-    free = (target.transient**2).sum() + len(found.value)
-    equations = 2 * (target.weight > 0).sum()
-    misfit = 2 * found.cost / jnp.maximum(equations - free, 1.0)
     return MatrixFit(
         parameterization.matrices(found.value), (d_mass, d_damping, d_stiffness), misfit, covariance, slopes
     )
