@@ -4,6 +4,7 @@ PYTHON ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PEERS := .venv-bench
+FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
@@ -27,15 +28,18 @@ test-all: lint
 
 # The peers live in an environment of their own; the figures go into benchmarks/README.md.
 bench: $(STAMP) $(PEERS)/.installed
-	mkdir -p build/bench
-	$(PEERS)/bin/python benchmarks/peers.py build/bench/peers.json
-	$(BIN)/python benchmarks/structure.py build/bench/structure.json
-	$(BIN)/python -m pytest benchmarks --benchmark-only -p no:cacheprovider --benchmark-json build/bench/timings.json
-	$(BIN)/python benchmarks/write_tables.py build/bench/timings.json build/bench/structure.json build/bench/peers.json
+	mkdir -p $(FIGURES)
+	OPENBLAS_NUM_THREADS=1 $(PEERS)/bin/python benchmarks/era_cases.py $(FIGURES)/cases.npz
+	$(BIN)/python benchmarks/era_rounds.py $(FIGURES)/cases.npz $(PEERS)/bin/python $(FIGURES)/era.json
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/rates.py $(FIGURES)/rates.json
+	$(PEERS)/bin/python benchmarks/peers.py $(FIGURES)/peers.json
+	$(BIN)/python benchmarks/structure.py $(FIGURES)/structure.json
+	$(BIN)/python -m pytest benchmarks --benchmark-only -p no:cacheprovider --benchmark-json $(FIGURES)/timings.json
+	$(BIN)/python benchmarks/write_tables.py $(FIGURES)
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)
-	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check -c benchmarks/constraints.txt control mdof
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check -c benchmarks/constraints.txt control mdof pymor pyyeti
 	@touch $@
 
 notebooks: $(STAMP)

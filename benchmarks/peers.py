@@ -1,4 +1,4 @@
-"""python-control and mdof on the flexible structure, and python-control on the ERA timings.
+"""python-control and mdof on the flexible structure.
 
     .venv-bench/bin/python benchmarks/peers.py OUT.json
 
@@ -25,6 +25,7 @@ warnings.simplefilter("ignore")  # an unstable model overflows: an outcome here,
 np.seterr(all="ignore")
 Model = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 Attempt = tuple[str, Callable[[], Model]]
+VERSIONS = ("control", "mdof", "numpy", "pymor", "pyyeti")  # of all peers, for the tables
 ADVANCES = (0, 1)  # samples by which the inputs are taken early
 
 
@@ -86,27 +87,9 @@ def trials(attempts: Callable[[np.ndarray, np.ndarray], Iterator[Attempt]]) -> l
     return rows
 
 
-def chain_response(samples: int, masses: int) -> np.ndarray:
-    """Markov parameters (masses, masses, samples) of a stable chain; any will do for a timing."""
-    stiffness = 4 * np.eye(masses) - 2 * np.eye(masses, k=1) - 2 * np.eye(masses, k=-1)
-    values, shapes = np.linalg.eigh(stiffness)
-    t = 0.05 * np.arange(samples)
-    decay = np.exp(-0.02 * t) * np.sin(np.sqrt(values)[:, None] * t)
-    return np.einsum("im,jm,mt->ijt", shapes, shapes, decay)
-
-
-def era_seconds(masses: int, blocks: int) -> float:
-    """One ERA by python-control."""
-    response = chain_response(2 * blocks + 1, masses)
-    begin = time.perf_counter()
-    control.eigensys_realization(response, 2 * masses, m=blocks, n=blocks)
-    return time.perf_counter() - begin
-
-
 def main() -> None:
     found = {
-        "versions": {name: version(name) for name in ("control", "mdof")},
-        "era": {"1000 x 1000, order 2": era_seconds(1, 1000), "3000 x 3000, order 6": era_seconds(3, 1000)},
+        "versions": {name: version(name) for name in VERSIONS},
         "structure": {},
     }
     if data.data_file().exists():

@@ -1,7 +1,7 @@
 """Timings, run by `make bench`; they assert nothing about speed.
 
-ERA against the full singular value decomposition of numpy on the same matrix, the impulse-response estimators,
-and the command `jaxsid identify` as a whole process, with an empty compilation cache and with a filled one.
+The impulse-response estimators, and the command `jaxsid identify` as a whole process, with an empty compilation cache
+and with a filled one.
 """
 
 import os
@@ -16,19 +16,6 @@ import jaxsid
 from jaxsid.examples import systems
 
 jax.config.update("jax_enable_x64", True)
-SIZES = {"1000 x 1000, order 2": (1, 2), "3000 x 3000, order 6": (3, 6)}
-BLOCKS = 1000
-
-
-def chain_response(masses: int) -> np.ndarray:
-    """Accelerations of the one- and three-mass systems to impulses, (samples, masses, masses)."""
-    from jaxsid.mechanics.first_order import physical_displacement_velocity
-    from jaxsid.mechanics.simulate import impulse_response_of
-
-    model = jaxsid.second_order(systems.one_dof() if masses == 1 else systems.three_dof())
-    return np.asarray(
-        impulse_response_of(physical_displacement_velocity(model), 0.05, samples=2 * BLOCKS + 1).h
-    )
 
 
 def random_record(model: jaxsid.LumpedModel, samples: int) -> tuple[jaxsid.Record, np.ndarray]:
@@ -41,29 +28,6 @@ def random_record(model: jaxsid.LumpedModel, samples: int) -> tuple[jaxsid.Recor
     y = y + 0.01 * y.std(axis=0) * rng.normal(size=y.shape)
     names = {"inputs": [i.name for i in model.inputs], "outputs": [s.name for s in model.sensors]}
     return jaxsid.Record(u, y, 0.05, **names), np.column_stack([0.05 * np.arange(samples), u, y])
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.benchmark(group="era")
-def test_era(benchmark, size):
-    masses, order = SIZES[size]
-    response = jaxsid.ImpulseResponse(chain_response(masses), 0.05)
-    run = lambda: jax.block_until_ready(jaxsid.era(response, order=order, rows=BLOCKS, cols=BLOCKS))  # noqa: E731
-    run()
-    found = benchmark.pedantic(run, rounds=5)
-    exact = np.asarray(response.h[1:100])
-    again = np.asarray(jaxsid.markov_parameters(found, samples=100))[1:]
-    benchmark.extra_info["error"] = float(np.abs(again - exact).max() / np.abs(exact).max())
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.benchmark(group="era")
-def test_numpy_svd(benchmark, size):
-    masses, _ = SIZES[size]
-    h = chain_response(masses)
-    k = np.arange(BLOCKS)
-    matrix = h[1 + k[:, None] + k].transpose(0, 2, 1, 3).reshape(BLOCKS * masses, -1)
-    benchmark.pedantic(np.linalg.svd, (matrix,), {"full_matrices": False}, rounds=1)
 
 
 @pytest.mark.parametrize(

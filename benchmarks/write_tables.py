@@ -1,15 +1,19 @@
 """Put the figures of one run into README.md, between its markers.
 
-python benchmarks/write_tables.py TIMINGS.json STRUCTURE.json PEERS.json
+    python benchmarks/write_tables.py FOLDER
+
+The folder holds what the other scripts wrote: timings, structure, peers, era and rates, each .json.
 """
 
 import json
 import os
 import platform
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from era_tables import case_table, era_table, memory_table, rates_table, target_table
 
 README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- figures: begin -->", "<!-- figures: end -->"
@@ -50,30 +54,45 @@ def structure_table(structure: dict, peers: dict) -> list[str]:
     return rows
 
 
-def timing_rows(timings: dict, peers: dict) -> list[str]:
+def timing_rows(timings: dict) -> list[str]:
     rows = ["| what | case | median, s |", "|---|---|---|"]
     for row in timings["benchmarks"]:
         what, _, case = row["name"].removeprefix("test_").partition("[")
         rows.append(f"| {what.replace('_', ' ')} | {case.rstrip(']')} | {row['stats']['median']:.3g} |")
-    rows += [f"| python-control | {case} | {seconds:.3g} |" for case, seconds in peers["era"].items()]
     return rows
 
 
+def machine(era: dict, versions: dict[str, str]) -> str:
+    """What it ran on: enough to know which figures may be compared."""
+    before, after = era["load"]
+    peers = ", ".join(f"{name} {number}" for name, number in versions.items())
+    return (
+        f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, jax {version('jax')}; "
+        f"{peers}. Load average before the realizations {before:.1f}, after them {after:.1f}."
+    )
+
+
 def main() -> None:
-    timings, structure, peers = (json.loads(Path(name).read_text()) for name in sys.argv[1:4])
+    folder = Path(sys.argv[1])
+    timings, structure, peers, era, rates = (
+        json.loads((folder / f"{name}.json").read_text())
+        for name in ("timings", "structure", "peers", "era", "rates")
+    )
+    sections = {
+        "Targets": target_table(era, rates),
+        "Cases": case_table(),
+        "Realizations, by tool": era_table(era),
+        "Memory": memory_table(era),
+        "Ensembles and covariance": rates_table(rates),
+        "Flexible structure, held-out prediction": structure_table(structure, peers),
+        "Timings": timing_rows(timings),
+    }
+    parts = [machine(era, peers["versions"])]
+    for title, rows in sections.items():
+        parts += ["", f"### {title}", "", *rows]
     text = README.read_text()
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    machine += f", load average {os.getloadavg()[2]:.1f}."
-    parts = [
-        machine,
-        "",
-        "### Flexible structure, held-out prediction",
-        "",
-        *structure_table(structure, peers),
-    ]
-    parts += ["", "### Timings", "", *timing_rows(timings, peers)]
     README.write_text(before + BEGIN + "\n\n" + "\n".join(parts) + "\n\n" + END + after)
 
 
