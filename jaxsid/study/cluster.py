@@ -1,0 +1,193 @@
+"""The jobs of a study on other processes, here or on many machines, through dask.distributed.
+
+Workers compute and hand results back; the process that began the study is the only one that writes. A job travels with
+its experiment, so that workers need no files. What a worker that dies was at goes to the others. When the scheduler is
+lost the study stops, and goes on when it is begun again.
+"""
+
+import functools
+import logging
+import pickle
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import dask.config
+import jax
+import numpy as np
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed.client import Future, FutureCancelledError
+from jaxtyping import Float
+
+from jaxsid.checks import InputError, JaxsidError, require
+from jaxsid.compilation import default_folder, keep_programs
+from jaxsid.study.engine import Done, Execute, Job, realizations
+from jaxsid.study.experiment import Experiment
+from jaxsid.study.store import versions
+
+AHEAD = 3  # jobs given out for each worker, so that none waits for the next
+FEWEST = 8  # workers that jobs are given out for, even while fewer are there
+LIVES = 3  # times that a job is given out anew after dask gave it up, since worker after worker died over it
+FAILURES = 10  # workers that may die over a job before dask gives it up
+
+_one_at_a_time = threading.Lock()  # linear algebra in two threads of one process may block for good
+
+
+class LostSchedulerError(JaxsidError):
+    """The scheduler went away while a study ran."""
+
+
+class Parcel(NamedTuple):
+    """A job on its way to a worker, and what the worker must have installed for it."""
+
+    case: int
+    first: int
+    count: int
+    seed: int
+    experiment: bytes
+    double: bool
+    versions: dict[str, str]
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Execute]:
+    """As many processes on this machine, gone when the block ends.
+
+    Raises:
+        InputError: fewer than one.
+    """
+    require(count >= 1, f"the number of workers must be at least 1, not {count}.")
+    settings = {
+        "distributed.scheduler.allowed-failures": FAILURES,
+        "distributed.nanny.pre-spawn-environ.OPENBLAS_NUM_THREADS": 1,
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield functools.partial(on_cluster, client)
+
+
+@contextmanager
+def remote_workers(address: str, timeout: float = 30.0) -> Iterator[Execute]:
+    """The workers of a scheduler, whenever they come and go.
+
+    Args:
+        address: of the scheduler, as `tcp://host:8786`.
+        timeout: seconds to wait for it.
+
+    Raises:
+        InputError: no scheduler answers there.
+    """
+    try:
+        client = Client(address, timeout=timeout)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no dask scheduler answers at '{address}' ({error}). Start one with `dask scheduler`, and give the "
+            "address that it prints, as tcp://host:8786."
+        ) from error
+    with client:
+        yield functools.partial(on_cluster, client)
+
+
+def on_cluster(client: Client, jobs: Iterable[Job]) -> Iterator[Done]:
+    """Give out a few jobs for each worker, and a new one for each result.
+
+    Raises:
+        LostSchedulerError: the scheduler went away.
+        InputError: a worker has no jaxsid, or other versions; a job killed worker after worker.
+    """
+    results, out = as_completed(loop=client.loop), _Out(client, iter(jobs))
+    try:
+        results.update(out.more())
+        for future in results:
+            job, lives = out.given.pop(future)
+            try:
+                values = future.result()
+            except KilledWorker as error:
+                results.add(out.again(job, lives, error))
+                continue
+            yield Done(job, values)
+            results.update(out.more())
+    except (FutureCancelledError, OSError) as error:
+        raise LostSchedulerError(
+            "the dask scheduler was lost. What was done is kept; start a scheduler and run the same command again."
+        ) from error
+    except (ImportError, RuntimeError) as error:
+        if isinstance(error, ImportError) or "deserialization" in str(error):
+            raise InputError(
+                f"a worker or the scheduler cannot load what the study needs ({error}). Install the same versions of "
+                'Python and of jaxsid there as here: pip install "jaxsid[study]".'
+            ) from error
+        raise
+
+
+class _Out:
+    """The jobs that are out, each with the number of times it may be given out again."""
+
+    def __init__(self, client: Client, jobs: Iterator[Job]):
+        self.client, self.jobs = client, jobs
+        self.given: dict[Future, tuple[Job, int]] = {}
+        self.packed: tuple[Experiment | None, bytes] = (None, b"")
+
+    def more(self) -> list[Future]:
+        """New jobs, as many as the workers that are there now want."""
+        most = AHEAD * max(self._workers(), FEWEST)
+        new = []
+        while len(self.given) < most and (job := next(self.jobs, None)) is not None:
+            new.append(self.submit(job, LIVES))
+        return new
+
+    def _workers(self) -> int:
+        there = self.client.nthreads()
+        assert isinstance(there, dict)  # a coroutine for asynchronous clients only
+        return len(there)
+
+    def submit(self, job: Job, lives: int) -> Future:
+        if self.packed[0] is not job.experiment:
+            self.packed = (job.experiment, pickle.dumps(job.experiment))
+        what = Parcel(*job[:4], self.packed[1], bool(jax.config.read("jax_enable_x64")), versions())
+        future = self.client.submit(work, what, pure=False)
+        self.given[future] = (job, lives)
+        return future
+
+    def again(self, job: Job, lives: int, error: KilledWorker) -> Future:
+        """The job once more after dask gave it up."""
+        if lives > 0:
+            return self.submit(job, lives - 1)
+        raise InputError(
+            f"realizations {job.first} to {job.first + job.count - 1} of case {job.case} killed worker after worker: "
+            "most likely for want of memory. Give each worker more, or write a smaller chunk in the study."
+        ) from error
+
+
+def work(parcel: Parcel) -> Float[np.ndarray, "count quantities"]:
+    """Do a job: this runs on a worker."""
+    here = versions()
+    differ = [f"{name} {here[name]} instead of {x}" for name, x in parcel.versions.items() if here[name] != x]
+    require(not differ, f"a worker has {', '.join(differ)}. Install the same versions on every machine.")
+    with _one_at_a_time:
+        _prepare(parcel.double)
+        job = Job(parcel.case, parcel.first, parcel.count, parcel.seed, _unpacked(parcel.experiment))
+        return realizations(job)
+
+
+@functools.cache
+def _prepare(double: bool) -> None:
+    """The precision of the process that began the study, and programs kept on disk for all workers of a machine."""
+    jax.config.update("jax_enable_x64", double)
+    keep_programs(default_folder())
+
+
+@functools.lru_cache(maxsize=4)
+def _unpacked(experiment: bytes) -> Experiment:
+    return pickle.loads(experiment)
