@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 JAXSID, PEERS = "era_jaxsid", "era_peers"
 THREADS = {"default": None, "one": "1"}
+BOTH, ONE, MANY = ("default", "one"), ("one",), ("default",)
 
 
 class Entry(NamedTuple):
@@ -32,35 +33,36 @@ class Entry(NamedTuple):
     rounds: int = 5
     repeats: int = 3
     warm: bool = True
-    threads: tuple[str, ...] = ("default", "one")
+    threads: tuple[str, ...] = BOTH
 
-    def once(self, rounds: int = 1, threads: tuple[str, ...] = ("default",)) -> "Entry":
+    def once(self, rounds: int = 1, threads: tuple[str, ...] | None = None) -> "Entry":
         """For what takes seconds: one call in each of few rounds."""
-        return self._replace(rounds=rounds, repeats=1, warm=False, threads=threads)
+        return self._replace(rounds=rounds, repeats=1, warm=False, threads=threads or self.threads)
 
 
-FAST, FULL = Entry(JAXSID, "jaxsid"), Entry(JAXSID, "jaxsid, full decomposition", rounds=3, repeats=1)
-NUMPY, CONTROL, PYYETI = (
-    Entry(PEERS, name, rounds=3, repeats=1) for name in ("numpy", "python-control", "pyYeti")
-)
+FAST = Entry(JAXSID, "jaxsid")
+FULL = Entry(JAXSID, "jaxsid, full decomposition", rounds=3, repeats=1, threads=ONE)
 PYMOR = Entry(PEERS, "pyMOR randomized")
 PROJECTED = Entry(PEERS, "pyMOR randomized, 15 output directions", rounds=3, repeats=1)
-BOTH = ("default", "one")
-THIN = [FAST, PYMOR._replace(rounds=2, repeats=1), PROJECTED, NUMPY._replace(rounds=5, repeats=1), FULL]
+NUMPY = Entry(PEERS, "numpy", repeats=1)
+CONTROL = Entry(PEERS, "python-control", rounds=3, repeats=1)
+PYYETI = Entry(PEERS, "pyYeti", rounds=3, repeats=1)
+SLOW = [entry.once(threads=MANY) for entry in (CONTROL, PYYETI)]
+THIN = [FAST, PYMOR.once(2), PROJECTED, NUMPY, FULL]
 PLAN = {
-    "A": [FAST, PYMOR, NUMPY.once(2, BOTH), CONTROL.once(2, BOTH), PYYETI.once(2, BOTH)],
-    "B": [FAST, PYMOR, NUMPY.once(), CONTROL.once(), PYYETI.once()],
+    "A": [FAST, PYMOR, NUMPY.once(2), CONTROL.once(2), PYYETI.once(2)],
+    "B": [FAST, PYMOR, NUMPY.once(threads=MANY), *SLOW],
     "C": [
         FAST._replace(repeats=1),
-        PYMOR.once(3, BOTH),
-        NUMPY.once(2, BOTH),
-        CONTROL.once(1, BOTH),
-        PYYETI.once(1, BOTH),
-        FULL.once(1, ("one",)),
+        PYMOR.once(3),
+        NUMPY.once(2),
+        CONTROL.once(threads=ONE),
+        PYYETI.once(threads=ONE),
+        FULL.once(),
     ],
     "D1": [*THIN, CONTROL, PYYETI],
     "D1 noisy": [*THIN, CONTROL, PYYETI],
-    "D2": [*THIN, CONTROL.once(), PYYETI.once()],
+    "D2": [*THIN, *SLOW],
     "D2 noisy": THIN,
 }
 # Tools whose memory is measured on B, and whether their compilation is done beforehand.
@@ -127,7 +129,7 @@ def memory(python: dict[str, str], cases: str) -> dict[str, float | None]:
     """Peaks above the baseline on B, each in a process of its own, MB."""
     peaks = {}
     for words, (module, tool, compiled) in MEMORY.items():
-        worker = Worker(python[module], module, cases, "one")
+        worker = Worker(python[module], module, cases, "default")
         peaks[words] = worker.ask(do="memory", tool=tool, case="B", compiled=compiled)
         worker.end()
     return peaks
