@@ -22,7 +22,7 @@ class ModalStructure(NamedTuple):
     """A structure by its modes, of which some are excited well.
 
     Attributes:
-        model: accelerations for forces.
+        model: displacements or accelerations for forces.
         frequencies: undamped, of the modes that are excited well, Hz.
         damping_ratios: of these.
         inputs, outputs: their names.
@@ -129,10 +129,10 @@ def turbine_generator() -> LumpedModel:
 
 
 def mini_mast() -> ModalStructure:
-    """A truss mast of 18 bays like Mini-Mast, by its modes: accelerations at six bays for three forces at the tip.
+    """A truss mast of 18 bays like Mini-Mast, by its modes: displacements of six bays for three forces at the tip.
 
-    Bending pairs at 0.86 and 6.1 Hz, torsion at 4.2 and 22.9 Hz, all excited well, and ten local modes of the
-    diagonals between 15 and 20 Hz, a twentieth as strong. Sensors along x, y and around z.
+    Bending pairs near 0.86 and 6.1 Hz and torsion at 4.2 Hz are excited well; torsion at 22.9 Hz and ten local modes of
+    the diagonals between 15 and 20 Hz are a twentieth as strong. Sensors along x, y and around z.
 
     Source: frequencies after the Mini-Mast control-structure interaction testbed user's guide, NASA TM-102630, 1989;
     shapes are smooth functions of the height, not those of the mast.
@@ -151,12 +151,12 @@ def mini_mast() -> ModalStructure:
     ]
     local = [(np.sin(np.pi * (2 + i) * heights), np.cos(i + np.arange(3.0))) for i in range(10)]
     shapes = np.stack([np.outer(h, direction).ravel() for h, direction in [*kinds, *local]], axis=1)
-    tip = np.stack([d for _, d in kinds] + [0.05 * d for _, d in local])
+    tip = np.stack([d for _, d in kinds[:5]] + [0.05 * d for _, d in [*kinds[5:], *local]])
     frequencies = np.array([0.86, 0.89, 4.19, 6.10, 6.21, 22.9, *np.linspace(14.9, 20.3, 10)])
     damping = np.array([0.018, 0.016, 0.015, 0.012, 0.013, 0.008, *np.full(10, 0.01)])
-    model = _accelerations(frequencies, damping, shapes, tip)
+    model = _modal_model(frequencies, damping, shapes, tip, accelerometers=False)
     sensors = tuple(f"bay{3 * i + 3}_{axis}" for i in range(6) for axis in ("x", "y", "rotation"))
-    excited = tuple(frequencies[:6].tolist()), tuple(damping[:6].tolist())
+    excited = tuple(frequencies[:5].tolist()), tuple(damping[:5].tolist())
     return ModalStructure(model, *excited, ("force_x", "force_y", "torque"), sensors, "Mini-Mast-like mast")
 
 
@@ -179,24 +179,33 @@ def galileo() -> ModalStructure:
     damping = 0.01 + 0.006 * np.cos(3.0 * modes)
     strong = modes % 3 == 0
     force = np.where(strong, 1.0, 0.01)[:, None]
-    model = _accelerations(frequencies, damping, shapes.reshape(162, 45), force)
+    model = _modal_model(frequencies, damping, shapes.reshape(162, 45), force, accelerometers=True)
     excited = tuple(frequencies[strong].tolist()), tuple(damping[strong].tolist())
     sensors = tuple(f"accelerometer{i + 1}" for i in range(162))
     return ModalStructure(model, *excited, ("shaker",), sensors, "Galileo-like spacecraft")
 
 
-def _accelerations(
+def _modal_model(
     frequencies: Float[np.ndarray, " modes"],
     damping: Float[np.ndarray, " modes"],
     shapes: Float[np.ndarray, "outputs modes"],
     forces: Float[np.ndarray, "modes inputs"],
+    *,
+    accelerometers: bool,
 ) -> ContinuousModel:
-    """p'' + 2 zeta w p' + w^2 p = forces u, y = shapes p''; the states of a mode are w p and p'."""
+    """p'' + 2 zeta w p' + w^2 p = forces u, y = shapes p or shapes p''; the states of a mode are w p and p'."""
     w = 2 * np.pi * frequencies
     count = len(w)
     A, B = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, forces.shape[1]))
     first, second = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
     A[first, second], A[second, first], A[second, second] = w, -w, -2 * damping * w
     B[second] = forces
-    arrays: list[Array] = [jnp.asarray(x) for x in (A, B, shapes @ A[second], shapes @ forces)]
+    displacement = np.zeros((count, 2 * count))
+    displacement[np.arange(count), first] = 1 / w
+    C, D = (
+        (shapes @ A[second], shapes @ forces)
+        if accelerometers
+        else (shapes @ displacement, 0 * shapes @ forces)
+    )
+    arrays: list[Array] = [jnp.asarray(x) for x in (A, B, C, D)]
     return ContinuousModel(*arrays)

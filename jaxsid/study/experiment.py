@@ -11,6 +11,7 @@ from jaxsid.mechanics.simulate import impulse_response_of
 from jaxsid.realization.era import era
 from jaxsid.realization.era_dc import era_dc
 from jaxsid.records import ImpulseResponse, Realization
+from jaxsid.study.bound import Sampling, cramer_rao
 from jaxsid.study.configuration import Case
 from jaxsid.study.factors import resolve
 from jaxsid.study.noise import disturbed
@@ -111,14 +112,15 @@ def make_experiment(case: Case) -> Experiment:
     swings, still = split(system.poles)
     dt = 1 / v["rate"]
     exact = np.asarray(impulse_response_of(system.model, dt, samples=plan.samples).h)
-    deviation = v["noise"] * np.sqrt(np.mean(exact**2, axis=(0, 2)))[:, None]
+    size = np.sqrt(np.mean(exact**2, axis=(0, 2)))
+    least = cramer_rao(system, structure, Sampling(dt, plan.samples, None, size, plan.colour))
     return Experiment(
         names,
         units,
         truth=jnp.asarray(truth),
-        bound=jnp.full(len(truth), jnp.nan),
+        bound=jnp.asarray(v["noise"] * least),
         exact=jnp.asarray(exact),
-        deviation=jnp.asarray(deviation),
+        deviation=jnp.asarray(v["noise"] * size[:, None]),
         dt=jnp.asarray(dt),
         swings=jnp.asarray(swings),
         still=jnp.asarray(still),

@@ -14,7 +14,7 @@ Value = str | int | float | bool
 METHODS = ("fourier", "direct", "wavelet", "inband")
 EXCITATIONS = ("multisine", "white", "chirp")
 ORDER = re.compile(r"true(\+\d+)?")
-MOST_ROWS = 400  # of a Hankel matrix that nobody asked to be larger
+MOST_ROWS = 200  # of a Hankel matrix that nobody asked to be larger
 RECORD_LENGTH = 8  # times the length of the impulse response
 
 
@@ -137,7 +137,7 @@ def _era_window(v: dict[str, Any], system: System) -> dict[str, Any]:
     """As many blocks as the samples allow, half rows and half columns, the rows within MOST_ROWS."""
     outputs, inputs = system.model.C.shape[0], system.model.B.shape[1]
     blocks = (v["samples"] - 3) // v["stride"] + 2  # rows and cols together
-    most = max(MOST_ROWS // outputs, -(-v["order"] // outputs))
+    most = max(MOST_ROWS // outputs, -(-v["order"] // outputs), 2)
     rows = v.get("rows") or (max(blocks - v["cols"], 1) if v.get("cols") else max(min(blocks // 2, most), 1))
     cols = v.get("cols") or max(blocks - rows, 1)
     check_reach(v["stride"] * (rows + cols - 2) + 2, v["samples"])
@@ -149,11 +149,7 @@ def _era_dc_window(v: dict[str, Any], system: System) -> dict[str, Any]:
     """Few rows, the first lag behind them, lags over a third of the samples, and columns for the rest."""
     outputs, inputs = system.model.C.shape[0], system.model.B.shape[1]
     step, stride = v.get("lag_step") or 1, v["stride"]
-    rows = (
-        v.get("rows") or max(2, -(-v["order"] // outputs))
-        if outputs * 2 < MOST_ROWS // 2
-        else v.get("rows") or 1
-    )
+    rows = v.get("rows") or max(-(-v["order"] // outputs), 2 if outputs < MOST_ROWS // 4 else 1)
     first = v.get("first_lag", rows * stride)
     lags = v.get("lags") or max(v["samples"] // (6 * step), 2)
     reach = 2 + stride * (rows - 2) + first + 2 * (lags - 1) * step

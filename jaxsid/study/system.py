@@ -69,7 +69,8 @@ class System(NamedTuple):
         name: for messages.
         model: the chosen inputs and outputs.
         poles: of the modes to be judged, one of each conjugate pair, slowest first, 1/s.
-        order: number of states that the sensors can see.
+        order: number of states that the sensors can see; of a structure given by its modes, twice the number of modes
+            that are excited well.
         rate: sampling rate unless the study says otherwise, Hz.
         samples: length of the impulse response, likewise.
         mechanics: None for a structure given by its modes.
@@ -169,7 +170,7 @@ def _modal(structure: ModalStructure, known: BuiltIn, sensors: str, inputs: str)
     model = ContinuousModel(*(jnp.asarray(x) for x in (A, B[:, columns], C[rows], D[rows][:, columns])))
     w, zeta = 2 * np.pi * np.array(structure.frequencies), np.array(structure.damping_ratios)
     poles = w * (-zeta + 1j * np.sqrt(1 - zeta**2))
-    return System(structure.name, model, poles, len(A), known.rate, known.samples, None)
+    return System(structure.name, model, poles, 2 * len(poles), known.rate, known.samples, None)
 
 
 def _judged(poles: np.ndarray, visible: int) -> np.ndarray:
