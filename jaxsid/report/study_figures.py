@@ -42,7 +42,14 @@ def spread_figure(panel: Panel, across: str, apart: str | None) -> Figure:
     """
     shown = kinds(panel.rows)[:MOST_KINDS]
     height = 1.3 + 1.25 * len(shown)
-    figure, axes = new_figure(panel.title, height, rows=len(shown), top=0.84, between=0.32, sharex=True)
+    figure, axes = new_figure(
+        panel.title,
+        height,
+        rows=len(shown),
+        top=0.72 + 0.17 * (len(levels(panel.rows, apart)) > 2),
+        between=0.32,
+        sharex=True,
+    )
     for ax, kind in zip(axes[:, 0], shown, strict=True):
         _spread(ax, [row for row in panel.rows if row.kind == kind], across, apart)
         title(ax, kind.replace("_", " "))
@@ -62,7 +69,7 @@ def _spread(ax: Axes, rows: Sequence[Row], across: str, apart: str | None) -> No
         ax.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
     bound = [pooled(some, "cramer_rao") for some in at]
     if np.isfinite(bound).any():
-        ax.plot(x, bound, color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="Cramér-Rao bound")
+        ax.plot(x, bound, color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="Cramér-Rao")
     log_scale(ax, "y")
 
 
@@ -84,7 +91,7 @@ def _legend_on_top(figure: Figure, ax: Axes, height: float) -> None:
     """A legend below the title of the figure, over the width of all axes."""
     look: dict[str, Any] = {"frameon": False, "fontsize": FONT - 0.5, "labelcolor": INK, "handlelength": 1.8}
     handles, names = ax.get_legend_handles_labels()
-    columns = 2 if max(map(len, names)) > 12 else 4
+    columns = 2 if max(map(len, names)) > 14 else 3
     figure.legend(
         handles, names, loc="upper left", bbox_to_anchor=(0.01, 1 - 0.24 / height), ncols=columns, **look
     )

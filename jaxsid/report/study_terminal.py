@@ -12,7 +12,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from jaxsid.report.numbers import percent
-from jaxsid.report.study_layout import cases, failed_share, kinds, level_text, pooled
+from jaxsid.report.study_layout import cases, failed_share, kinds, named, pooled
 from jaxsid.study.configuration import Study
 from jaxsid.study.engine import Progress
 from jaxsid.study.summary import Row
@@ -84,12 +84,13 @@ def print_study(study: Study, rows: Sequence[Row], console: Console | None = Non
     console = Console() if console is None else console
     every, names = cases(rows), kinds(rows)
     table = Table(title=escape(study.name), title_justify="left", title_style="bold", header_style="dim")
-    for column in ("case", *study.varied, *(name.replace("_", " ") for name in names), "failed"):
-        table.add_column(column, justify="right", overflow="fold")
+    table.add_column("case", overflow="fold")
+    for column in (*(name.replace("_", " ") for name in names), "failed"):
+        table.add_column(column, justify="right")
     for case in every[:SHOWN]:
-        factors = (escape(level_text(case[0].factors[name])) for name in study.varied)
+        factors = ", ".join(named(name, case[0].factors[name]) for name in study.varied)
         spread = (percent(pooled([row for row in case if row.kind == name], "std")) for name in names)
-        table.add_row(str(case[0].case), *factors, *spread, percent(failed_share(case)))
+        table.add_row(escape(f"{case[0].case} {factors}"), *spread, percent(failed_share(case)))
     console.print(table)
     console.print("[dim]Standard deviation over truth, geometric mean over the quantities of a kind.[/]")
     if len(every) > SHOWN:

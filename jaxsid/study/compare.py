@@ -33,8 +33,8 @@ class Comparison(NamedTuple):
 def compare_levels(rows: Sequence[Row], varied: Sequence[str]) -> list[Comparison]:
     """Every level of every varied factor against that factor's best level, where cases allow it.
 
-    Two rows are compared where quantity, truth and all other varied factors are the same; so factors that change the
-    truth, such as the system, have no entry, nor have those of a random sweep.
+    Two cases are compared, quantity by quantity, where all other varied factors and the truth are the same; so factors
+    that change the truth, such as the system, have no entry, nor have those of a random sweep.
 
     Args:
         rows: summary of a study.
@@ -72,18 +72,25 @@ def _against(rows: Sequence[Row], factor: str, others: set[str], level: Level, b
 def _pairs(
     rows: Sequence[Row], factor: str, others: set[str], level: Level, best: Level
 ) -> Iterator[tuple[Row, Row]]:
-    """Rows with the level, each with the one with the best level that differs in nothing else."""
-    twins = {_identity(row, others): row for row in rows if row.factors[factor] == best}
+    """Rows with the level, each with that of the same quantity in the case that has the best level instead."""
+    twins = _by_setting(rows, factor, others, best)
+    for setting, case in _by_setting(rows, factor, others, level).items():
+        both = [(row, twins[setting][name]) for name, row in case.items() if name in twins.get(setting, {})]
+        if all(math.isclose(a.truth, b.truth, rel_tol=SAME) for a, b in both):
+            yield from ((a, b) for a, b in both if _known(a) and _known(b))
+
+
+def _by_setting(
+    rows: Sequence[Row], factor: str, others: set[str], level: Level
+) -> dict[tuple, dict[str, Row]]:
+    """Rows with a level of the factor, by the levels of the other factors and by quantity."""
+    found: dict[tuple, dict[str, Row]] = {}
     for row in rows:
-        twin = twins.get(_identity(row, others))
-        if row.factors[factor] == level and twin is not None and _comparable(row, twin):
-            yield row, twin
+        if row.factors[factor] == level:
+            setting = tuple(row.factors[name] for name in sorted(others))
+            found.setdefault(setting, {})[row.quantity] = row
+    return found
 
 
-def _identity(row: Row, others: set[str]) -> tuple:
-    return row.quantity, *(row.factors[name] for name in sorted(others))
-
-
-def _comparable(a: Row, b: Row) -> bool:
-    known = all(x.rmse > 0 and math.isfinite(x.rmse) and math.isfinite(x.rmse_error) for x in (a, b))
-    return known and math.isclose(a.truth, b.truth, rel_tol=SAME, abs_tol=0.0)
+def _known(row: Row) -> bool:
+    return row.rmse > 0 and math.isfinite(row.rmse) and math.isfinite(row.rmse_error)

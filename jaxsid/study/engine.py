@@ -13,21 +13,43 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxsid.checks import InputError, JaxsidError
 from jaxsid.study.configuration import Case, Study
-from jaxsid.study.experiment import Experiment, make_experiment
+from jaxsid.study.experiment import make_experiment
 from jaxsid.study.parts import missing, sound_parts, write_part
 from jaxsid.study.store import Facts, case_folder, read_facts, write_facts
 from jaxsid.uncertainty.ensemble import BATCH, ensemble
 
 KEPT = 16  # experiments in memory
 RECENT = 32  # finished chunks that the remaining time is told from
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """What `jaxsid.study.experiment.Experiment` is: from a key to estimates of named quantities, whose truth is known.
+
+    Modules that differ in arrays only share a compiled program.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def units(self) -> tuple[str, ...]: ...
+
+    @property
+    def truth(self) -> Float[Array, " q"]: ...
+
+    @property
+    def bound(self) -> Float[Array, " q"]: ...
+
+    def __call__(self, key: Array) -> Float[Array, " q"]: ...
 
 
 class Job(NamedTuple):
@@ -37,7 +59,7 @@ class Job(NamedTuple):
     first: int
     count: int
     seed: int
-    experiment: Experiment
+    experiment: Estimator
 
 
 class Done(NamedTuple):
@@ -77,7 +99,7 @@ def run_study(
     execute: Execute = in_process,
     progress: Callable[[Progress], None] = lambda _: None,
     say: Callable[[str], None] = lambda _: None,
-    make: Callable[[Case], Experiment] = make_experiment,
+    make: Callable[[Case], Estimator] = make_experiment,
 ) -> None:
     """Compute every realization that the store lacks.
 
@@ -108,7 +130,7 @@ def run_study(
         progress(clock.step(job.count))
 
 
-def _made(case: Case, make: Callable[[Case], Experiment]) -> Experiment:
+def _made(case: Case, make: Callable[[Case], Estimator]) -> Estimator:
     """The experiment; an error says which case it was."""
     try:
         return make(case)
@@ -117,7 +139,7 @@ def _made(case: Case, make: Callable[[Case], Experiment]) -> Experiment:
         raise InputError(f"case {case.index} ({factors}): {error}") from error
 
 
-def _facts(experiment: Experiment) -> Facts:
+def _facts(experiment: Estimator) -> Facts:
     return Facts(
         experiment.names, experiment.units, np.asarray(experiment.truth), np.asarray(experiment.bound)
     )

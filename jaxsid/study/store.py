@@ -73,14 +73,17 @@ def _claimed(folder: Path) -> TextIO:
     try:
         (folder / "parts").mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("a+")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to: {error.strerror}.") from error
+    try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        holder = (folder / "lock").read_text().strip()
+    except OSError as error:
+        with lock:
+            lock.seek(0)
+            holder = lock.read().strip() or error.strerror
         bad_input(
             f"{folder}: another jaxsid is at work there ({holder}). Let it finish, stop it, or name another folder."
         )
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written to: {error.strerror}.") from error
     lock.truncate(0)
     lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
     lock.flush()
