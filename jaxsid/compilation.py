@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -30,6 +31,7 @@ MOST_BYTES = 500_000_000  # what the folder may hold before the programs unused 
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_debug_nans")
 LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 BUILT_ON = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+LASTING = ("jaxsid", "builtins", *BUILT_ON)
 
 
 class _Folder(NamedTuple):
@@ -73,6 +75,12 @@ def keep_programs(folder: str | Path | None) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def default_folder() -> Path:
+    """Where the command keeps its programs: $JAXSID_CACHE, or `jaxsid` in the user's cache."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get("JAXSID_CACHE") or home / "jaxsid")
+
+
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """As `equinox.filter_jit`: arrays are traced, all else is static; kept on disk after `keep_programs`."""
     jitted = eqx.filter_jit(function)
@@ -107,7 +115,7 @@ def _key(function: Callable, leaves: list, tree: Any, stamp: bytes) -> bytes | N
         os.environ.get("XLA_FLAGS"),
     )
     stream = io.BytesIO()
-    pickler = pickle.Pickler(stream)
+    pickler = _Namer(stream)
     pickler.fast = True  # without a memo, so that equal values give equal bytes
     try:
         pickler.dump(
@@ -116,6 +124,15 @@ def _key(function: Callable, leaves: list, tree: Any, stamp: bytes) -> bytes | N
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError):
         return None
     return hashlib.sha256(stamp + stream.getvalue()).digest() if settings[0] == "cpu" else None
+
+
+class _Namer(pickle.Pickler):
+    """Refuses functions and classes from elsewhere: their source may change without their name."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type | FunctionType) and (obj.__module__ or "").partition(".")[0] not in LASTING:
+            raise pickle.PicklingError(f"{obj} is not ours")
+        return NotImplemented
 
 
 class _Described:

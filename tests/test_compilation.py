@@ -145,6 +145,21 @@ def test_a_callable_argument_is_compiled_but_not_kept(folder: Path):
     assert not list(folder.glob("*"))
 
 
+def test_what_another_module_defines_is_compiled_but_not_kept(folder: Path, matrix: np.ndarray):
+    """Its source may change while its name stays."""
+    double = compiled(lambda pair: pair.values * 2)
+    np.testing.assert_array_equal(double(Pair(jnp.asarray(matrix), "foreign")), 2 * matrix)
+    assert not list(folder.glob("*"))
+
+
+def test_random_keys_go_in(folder: Path):
+    draw = lambda: compiled(lambda key: jax.random.normal(key, (3,)))  # noqa: E731
+    first = draw()(jax.random.key(3))
+    assert len(list(folder.iterdir())) == 1
+    np.testing.assert_array_equal(draw()(jax.random.key(3)), first)
+    np.testing.assert_array_equal(first, jax.random.normal(jax.random.key(3), (3,)))
+
+
 def test_records_go_in_and_come_out(folder: Path):
     model = second_order(three_dof())
     kept = physical_displacement_velocity(model)

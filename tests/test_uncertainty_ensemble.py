@@ -4,7 +4,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,6 +50,26 @@ def test_any_chunk_and_any_start_give_the_same_bits():
     for first, count in ((21, 30), (64, 6)):
         part = ensemble(one, KEY, count, first=first, chunk=32)
         np.testing.assert_array_equal(part["stiffness"], whole["stiffness"][first : first + count])
+
+
+class Noisy(eqx.Module):
+    """A number in noise; counts how often it is traced."""
+
+    level: jax.Array
+    traces: ClassVar[list[int]] = []
+
+    def __call__(self, key):
+        self.traces.append(1)
+        return self.level * jax.random.normal(key)
+
+
+def test_modules_that_differ_in_numbers_share_a_program():
+    quiet, loud = (Noisy(jnp.asarray(level)) for level in (0.1, 1.0))
+    first = ensemble(quiet, KEY, 40, chunk=16)
+    traced = len(Noisy.traces)
+    np.testing.assert_allclose(ensemble(loud, KEY, 40, chunk=16), 10 * first, rtol=1e-12)
+    np.testing.assert_array_equal(ensemble(quiet, KEY, 5, first=32, chunk=16), first[32:37])
+    assert len(Noisy.traces) == traced
 
 
 def test_it_is_the_loop():

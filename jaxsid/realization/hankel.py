@@ -9,6 +9,7 @@ from math import gcd, log2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Complex, Float
 
 # Cost of one element of a dense product against one butterfly of a Fourier transform, measured on CPU.
@@ -118,9 +119,11 @@ def hankel_matrix(
     first: int = 0,
 ) -> Float[Array, "rows cols"]:
     """The dense block Hankel matrix with blocks g[first + s_i + t_j]. Source: thesis [4.14]."""
-    index = first + np.asarray(row_steps)[:, None] + np.asarray(column_steps)
-    blocks = jnp.swapaxes(g[index], 1, 2)
-    return blocks.reshape(len(row_steps) * g.shape[1], len(column_steps) * g.shape[2])
+    g = jnp.swapaxes(g[first : first + row_steps[-1] + column_steps[-1] + 1], 0, 1)
+    columns = np.asarray(column_steps)
+    # in a loop, or XLA computes what g is made of again for each place that a sample is put in
+    blocks = lax.map(lambda s: g[:, s + columns], jnp.asarray(row_steps))
+    return blocks.reshape(len(row_steps) * g.shape[0], len(column_steps) * g.shape[2])
 
 
 def hankel_operator(

@@ -18,8 +18,10 @@ from jaxtyping import Array, Float
 from jaxsid.realization.hankel import DenseOperator
 from jaxsid.realization.lapack import qr, svd
 
+# A narrow block ends most searches at a small price; the few that it does not go on with a block twice as wide.
+NARROW_RESTARTS = 5
 RESTARTS = 60
-OVERSAMPLING = 10
+OVERSAMPLING = 5
 # Residual, in units of eps * the largest singular value, at which iteration stops: that of LAPACK.
 RESIDUAL = 30.0
 CG_STEPS = 300
@@ -47,14 +49,9 @@ class Subspace(NamedTuple):
     values: Float[Array, " k"]
 
 
-def block_width(shape: tuple[int, int], order: int) -> int:
-    """Columns of a Krylov block: twice the order and some, so that the values after the cut are seen too."""
-    return min(2 * order + OVERSAMPLING, *shape)
-
-
 def small_enough(shape: tuple[int, int], order: int) -> bool:
     """Whether a full decomposition costs no more than the iteration."""
-    return min(shape) <= 3 * block_width(shape, order)
+    return min(shape) <= 6 * (order + OVERSAMPLING)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
@@ -74,8 +71,7 @@ def dominant_subspace(operator: LinearOperator, order: int, full: bool) -> Subsp
         assert isinstance(operator, DenseOperator)
         u, s, vt = svd(operator.matrix)
         return Subspace(u[:, :order], vt[:order].T, s)
-    width = block_width(operator.shape, order)
-    return _iterate(operator, order, width, RESTARTS)
+    return _iterate(operator, order)
 
 
 @dominant_subspace.defjvp
@@ -112,7 +108,10 @@ def leading_values(operator: LinearOperator, count: int) -> Float[Array, " count
         count: how many.
     """
     width = min(count + OVERSAMPLING, *operator.shape)
-    return _iterate(operator, count, width, ROUGH_RESTARTS).values[:count]
+    state = _start(operator, width)
+    for _ in range(ROUGH_RESTARTS):
+        state = _expand(operator, state, width)
+    return state.values[:count]
 
 
 def _cg(product: Callable[[Array], Array], right_side: Array) -> Array:
@@ -163,15 +162,15 @@ def _orthonormal_against(basis: Array, x: Array) -> Array:
 
 
 def _triplets(basis: Array, products: Array, width: int) -> tuple[Array, Array, Array]:
-    """Leading singular triplets of Q (H' Q)' from an orthonormal Q and H' Q."""
+    """Leading singular vectors, and all values, of Q (H' Q)' from an orthonormal Q and H' Q."""
     z, t = _tall_qr(products)
     a, s, bt = svd(t.T)
-    return basis @ a[:, :width], s[:width], z @ bt[:width].T
+    return basis @ a[:, :width], s, z @ bt[:width].T
 
 
 class _State(NamedTuple):
     left: Array
-    values: Array
+    values: Array  # twice as many as vectors: the later ones are estimates from below
     right: Array
     image: Array  # H times right
     count: Array
@@ -183,27 +182,69 @@ def _residual(state: _State, order: int) -> Array:
     return jnp.max(jnp.linalg.norm(error, axis=0)) / jnp.maximum(state.values[0], jnp.finfo(error.dtype).tiny)
 
 
-def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
-    """One restart: the Krylov space of two blocks from the images of the last right vectors."""
-    first = _orthonormal(state.image)
-    first_product = operator.rmv(first)
-    second = _orthonormal_against(first, operator.mv(first_product))
-    products = jnp.concatenate([first_product, operator.rmv(second)], axis=1)
-    left, values, right = _triplets(jnp.concatenate([first, second], axis=1), products, width)
-    return _State(left, values, right, operator.mv(right), state.count + 1)
-
-
-def _iterate(operator: LinearOperator, order: int, width: int, restarts: int) -> Subspace:
+def _start(operator: LinearOperator, width: int) -> _State:
+    """Triplets from the image of random vectors."""
     cols = operator.shape[1]
     dtype = jax.eval_shape(operator.mv, jax.ShapeDtypeStruct((cols, 1), jnp.result_type(float))).dtype
     start = jax.random.uniform(jax.random.key(0), (cols, width), dtype, -1.0, 1.0)
     basis = _orthonormal(operator.mv(start))
     left, values, right = _triplets(basis, operator.rmv(basis), width)
-    state = _State(left, values, right, operator.mv(right), jnp.array(0))
-    tolerance = RESIDUAL * jnp.finfo(dtype).eps
+    later = jnp.zeros(_values_kept(operator, width) - width, dtype)
+    return _State(left, jnp.concatenate([values, later]), right, operator.mv(right), jnp.array(0))
+
+
+def _values_kept(operator: LinearOperator, width: int) -> int:
+    return min(2 * width, *operator.shape)
+
+
+def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
+    """One restart: the Krylov space of two blocks from the images of the last right vectors."""
+    first = _orthonormal(state.image)
+    first_product = operator.rmv(first)
+    second = _orthonormal_against(first, operator.mv(first_product))
+    # no more directions than the matrix has
+    second = second[:, : _values_kept(operator, width) - width]
+    basis = jnp.concatenate([first, second], axis=1)
+    products = jnp.concatenate([first_product, operator.rmv(second)], axis=1)
+    left, values, right = _triplets(basis, products, width)
+    return _State(left, values, right, operator.mv(right), state.count + 1)
+
+
+def _widen(operator: LinearOperator, state: _State, width: int) -> _State:
+    """The state with more vectors; the new ones are random until the next restart."""
+    rows, cols = operator.shape
+    more = width - state.left.shape[1]
+    dtype = state.image.dtype
+    blank = jnp.zeros((rows, more), dtype), jnp.zeros((cols, more), dtype)
+    random = jax.random.uniform(jax.random.key(1), (rows, more), dtype, -1.0, 1.0)
+    values = jnp.concatenate(
+        [state.values, jnp.zeros(_values_kept(operator, width) - len(state.values), dtype)]
+    )
+    return _State(
+        jnp.concatenate([state.left, blank[0]], axis=1),
+        values,
+        jnp.concatenate([state.right, blank[1]], axis=1),
+        jnp.concatenate([state.image, random * state.values[-1] / rows**0.5], axis=1),
+        state.count,
+    )
+
+
+def _iterate(operator: LinearOperator, order: int) -> Subspace:
+    narrow, wide = (min(k * (order + OVERSAMPLING), *operator.shape) for k in (1, 2))
+    state = _start(operator, narrow)
+    kept = len(state.values)
+    for width, restarts in ((narrow, NARROW_RESTARTS), (wide, RESTARTS)):
+        if width > narrow:
+            state = _widen(operator, state, width)
+        state = _restart(operator, state, order, width, restarts)
+    return Subspace(state.left[:, :order], state.right[:, :order], state.values[:kept])
+
+
+def _restart(operator: LinearOperator, state: _State, order: int, width: int, restarts: int) -> _State:
+    """Restarts until the residual of the kept triplets is rounding."""
+    tolerance = RESIDUAL * jnp.finfo(state.image.dtype).eps
 
     def unfinished(state: _State) -> Array:
         return (state.count < restarts) & (_residual(state, order) > tolerance)
 
-    state = jax.lax.while_loop(unfinished, lambda st: _expand(operator, st, width), state)
-    return Subspace(state.left[:, :order], state.right[:, :order], state.values)
+    return jax.lax.while_loop(unfinished, lambda st: _expand(operator, st, width), state)
