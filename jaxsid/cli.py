@@ -5,7 +5,7 @@ import gc
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -157,15 +157,92 @@ def demo(
         _summary(found, out)
 
 
+@app.command()
+def study(
+    file: Annotated[
+        Path, typer.Argument(help="Study file (TOML): factors, noise, realizations.", metavar="STUDY.toml")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for results.parquet, summary.csv and report.html; a study begun there goes on."
+        ),
+    ],
+    workers: Annotated[
+        int | None, typer.Option(help="Processes on this machine; default: this one alone.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler whose workers compute, tcp://host:8786.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """How noise, sensors and settings spread what is identified: thousands of realizations of many cases."""
+    with _errors(), _resumable(out), _study_view(quiet) as view:
+        view.say("loading")
+        _numerics()
+        from jaxsid.report.study_html import write_study_report
+        from jaxsid.study.configuration import read_study
+        from jaxsid.study.engine import run_study
+        from jaxsid.study.store import open_store
+        from jaxsid.study.tables import write_tables
+
+        plan = read_study(file)
+        with open_store(out, plan) as store, _workers(workers, scheduler) as execute:
+            run_study(plan, store, execute=execute, progress=view.progress, say=view.say)
+            view.say("tables and report")
+            rows = write_tables(plan, store)
+            write_study_report(plan, rows, store / "report.html")
+    if not quiet:
+        from jaxsid.report.study_terminal import print_study
+
+        print_study(plan, rows)
+        typer.echo(f"\nWritten to {out}: results.parquet, summary.parquet, summary.csv, report.html")
+
+
+def _study_view(quiet: bool):
+    """Progress of a study, once all that it needs is known to be there."""
+    from jaxsid.report.html import check_installed
+
+    check_installed("dask", "distributed", "pyarrow", user="A study", extra="study")
+    check_installed("matplotlib", "jinja2")
+    from jaxsid.report.study_terminal import study_view
+
+    return study_view(quiet)
+
+
+def _workers(count: int | None, scheduler: str | None):
+    """What does the jobs of a study: this process, processes of this machine, or those of a scheduler."""
+    if count is None and scheduler is None:
+        from jaxsid.study.engine import in_process
+
+        return nullcontext(in_process)
+    from jaxsid.checks import require
+    from jaxsid.study.cluster import local_workers, remote_workers
+
+    require(count is None or scheduler is None, "--workers and --scheduler exclude each other.")
+    return local_workers(count) if count is not None else remote_workers(str(scheduler))
+
+
+@contextmanager
+def _resumable(out: Path) -> Iterator[None]:
+    """An interrupt is no failure: what is done is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(
+            f"jaxsid: stopped. What was done is kept in {out}; the same command goes on from there.", err=True
+        )
+        raise typer.Exit(130) from None
+
+
 def _numerics() -> None:
     """Double precision, and compiled programs kept on disk so that the next run starts at once."""
     import jax
 
-    from jaxsid.compilation import keep_programs
+    from jaxsid.compilation import default_folder, keep_programs
 
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     jax.config.update("jax_enable_x64", True)
-    keep_programs(os.environ.get("JAXSID_CACHE") or home / "jaxsid")
+    keep_programs(default_folder())
 
 
 def _method(choice: Method, records, say):

@@ -25,11 +25,10 @@ def write_report(found: Identification, path: Path | str) -> None:
     write_atomically(path, lambda stream: stream.write(text))
 
 
-def check_installed(*packages: str) -> None:
-    """Raise InputError where a package that the reports need is missing."""
+def check_installed(*packages: str, user: str = "The report", extra: str = "plot") -> None:
+    """Raise InputError where a package is missing that `user` needs and that the extra `extra` installs."""
     missing = [name for name in packages if find_spec(name) is None]
     require(
         not missing,
-        f"The report needs {' and '.join(missing)}, not installed here. Install it: pip install "
-        "'jaxsid[plot]'.",
+        f'{user} needs {" and ".join(missing)}, not installed here. Install it: pip install "jaxsid[{extra}]".',
     )

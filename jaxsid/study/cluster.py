@@ -8,7 +8,6 @@ lost the study stops, and goes on when it is begun again.
 import functools
 import logging
 import pickle
-import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -22,16 +21,13 @@ from jaxtyping import Float
 
 from jaxsid.checks import InputError, JaxsidError, require
 from jaxsid.compilation import default_folder, keep_programs
-from jaxsid.study.engine import Done, Execute, Job, realizations
-from jaxsid.study.experiment import Experiment
+from jaxsid.study.engine import Done, Estimator, Execute, Job, realizations
 from jaxsid.study.store import versions
 
 AHEAD = 3  # jobs given out for each worker, so that none waits for the next
 FEWEST = 8  # workers that jobs are given out for, even while fewer are there
 LIVES = 3  # times that a job is given out anew after dask gave it up, since worker after worker died over it
 FAILURES = 10  # workers that may die over a job before dask gives it up
-
-_one_at_a_time = threading.Lock()  # linear algebra in two threads of one process may block for good
 
 
 class LostSchedulerError(JaxsidError):
@@ -48,6 +44,20 @@ class Parcel(NamedTuple):
     experiment: bytes
     double: bool
     versions: dict[str, str]
+
+    def called(self) -> bytes:
+        """A pickle whose loading does the job, so that even the name of this module is first met within a task.
+
+        A worker without the library that got `work` itself would die of the message, without a word to anybody.
+        """
+        return pickle.dumps(_Call(self))
+
+
+class _Call(NamedTuple):
+    parcel: Parcel
+
+    def __reduce__(self) -> tuple:
+        return work, (self.parcel,)
 
 
 @contextmanager
@@ -137,7 +147,7 @@ class _Out:
     def __init__(self, client: Client, jobs: Iterator[Job]):
         self.client, self.jobs = client, jobs
         self.given: dict[Future, tuple[Job, int]] = {}
-        self.packed: tuple[Experiment | None, bytes] = (None, b"")
+        self.packed: tuple[Estimator | None, bytes] = (None, b"")
 
     def more(self) -> list[Future]:
         """New jobs, as many as the workers that are there now want."""
@@ -156,7 +166,7 @@ class _Out:
         if self.packed[0] is not job.experiment:
             self.packed = (job.experiment, pickle.dumps(job.experiment))
         what = Parcel(*job[:4], self.packed[1], bool(jax.config.read("jax_enable_x64")), versions())
-        future = self.client.submit(work, what, pure=False)
+        future = self.client.submit(pickle.loads, what.called(), pure=False, priority=LIVES - lives)
         self.given[future] = (job, lives)
         return future
 
@@ -171,14 +181,13 @@ class _Out:
 
 
 def work(parcel: Parcel) -> Float[np.ndarray, "count quantities"]:
-    """Do a job: this runs on a worker."""
+    """Do a job: this runs on a worker, in as many threads at once as that has."""
     here = versions()
     differ = [f"{name} {here[name]} instead of {x}" for name, x in parcel.versions.items() if here[name] != x]
     require(not differ, f"a worker has {', '.join(differ)}. Install the same versions on every machine.")
-    with _one_at_a_time:
-        _prepare(parcel.double)
-        job = Job(parcel.case, parcel.first, parcel.count, parcel.seed, _unpacked(parcel.experiment))
-        return realizations(job)
+    _prepare(parcel.double)
+    job = Job(parcel.case, parcel.first, parcel.count, parcel.seed, _unpacked(parcel.experiment))
+    return realizations(job, threads=1)
 
 
 @functools.cache
@@ -189,5 +198,5 @@ def _prepare(double: bool) -> None:
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(experiment: bytes) -> Experiment:
+def _unpacked(experiment: bytes) -> Estimator:
     return pickle.loads(experiment)

@@ -86,10 +86,15 @@ def in_process(jobs: Iterable[Job]) -> Iterator[Done]:
         yield Done(job, realizations(job))
 
 
-def realizations(job: Job) -> Float[np.ndarray, "count quantities"]:
-    """Do a job. Calls hold one batch each: one program serves every chunk, and an interrupt is heard between them."""
+def realizations(job: Job, threads: int | None = None) -> Float[np.ndarray, "count quantities"]:
+    """Do a job, in batches: one program serves every chunk, and an interrupt is heard between them.
+
+    Args:
+        job: what to do.
+        threads: as for `ensemble`.
+    """
     key = jax.random.fold_in(jax.random.key(job.seed), job.case)
-    return ensemble(job.experiment, key, job.count, first=job.first, chunk=BATCH)
+    return ensemble(job.experiment, key, job.count, first=job.first, chunk=BATCH, threads=threads)
 
 
 def run_study(
