@@ -26,8 +26,9 @@ jax.config.update("jax_enable_x64", True)
 KEY = jax.random.key(0)
 NOISE = 0.01  # of the root mean square of the impulse response past its feedthrough
 MONTE_CARLO = 10_000
-MEMORY_COUNTS, MEMORY_CHUNK = (256, 1024, 4096), 256
-LATENCY_CALLS = 30
+MEMORY_COUNTS, MEMORY_CHUNK = (256, 4096), 256
+ONE_POOL = {"MALLOC_ARENA_MAX": "1"}  # a pool of memory for each thread fills by chance, whatever the count
+LATENCY_CALLS = 200
 
 
 class Chain(NamedTuple):
@@ -115,20 +116,23 @@ def memory() -> dict[str, float | None]:
     peaks = {}
     for count in MEMORY_COUNTS:
         command = [sys.executable, __file__, "--memory", str(count)]
-        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=os.environ | ONE_POOL
+        )
         peaks[str(count)] = json.loads(done.stdout)
     return peaks
 
 
-def latency(run: Callable[[], object]) -> float:
-    """Median time of a call that has been called before, s."""
-    jax.block_until_ready(run())
-    seconds = []
-    for _ in range(LATENCY_CALLS):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds)
+def latencies(runs: list[Callable[[], object]]) -> list[float]:
+    """Median times of calls that take turns and have been called before, s."""
+    seconds = [[] for _ in runs]
+    for turn in range(1 + LATENCY_CALLS):
+        for run, mine in zip(runs, seconds, strict=True):
+            begin = time.perf_counter()
+            jax.block_until_ready(run())
+            if turn:
+                mine.append(time.perf_counter() - begin)
+    return [statistics.median(mine) for mine in seconds]
 
 
 def delta_method() -> dict[str, float]:
@@ -141,7 +145,7 @@ def delta_method() -> dict[str, float]:
         return found.value, found.deviation
 
     plain, spread = jax.jit(lambda h: matrices_and_modes(USUAL.realization(h))), jax.jit(spread)
-    one, both = latency(lambda: plain(h)), latency(lambda: spread(h))
+    one, both = latencies([lambda: plain(h), lambda: spread(h)])
     drawn = jaxsid.ensemble(USUAL.experiment(matrices_and_modes), KEY, MONTE_CARLO)
     ratios = jax.tree.map(lambda mine, theirs: np.asarray(mine) / theirs.std(axis=0), spread(h)[1], drawn)
     off = {name: float(np.abs(x - 1).max()) for name, x in ratios.items()}
