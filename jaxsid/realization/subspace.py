@@ -1,8 +1,10 @@
 """Dominant singular subspaces of an operator, by restarted block Krylov iteration, with their derivative.
 
-The iteration goes on until the residual of the kept singular triplets reaches rounding, so that the answer is
-that of a full singular value decomposition whatever the gap at the cut. Products with the transposed matrix
-are never paired into a Gram matrix, which would lose everything below 1e-8 of the largest singular value.
+The iteration goes on until the residual of the kept singular triplets reaches rounding, or vanishes beside the first
+discarded singular value, which is noise: the answer is that of a full singular value decomposition whatever the gap
+at the cut. Where that gap is small and the matrix not large, the full decomposition takes over. Products with the
+transposed matrix are never paired into a Gram matrix, which would lose everything below 1e-8 of the largest singular
+value.
 Source: Musco and Musco, "Randomized block Krylov methods", NeurIPS 2015; Baglama and Reichel, SIAM J. Sci.
 Comput. 27, 2005 (restarting).
 """
@@ -15,15 +17,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsid.realization.hankel import DenseOperator
+from jaxsid.realization.hankel import LARGEST_DENSE, DenseOperator
 from jaxsid.realization.lapack import qr, svd
 
-# A narrow block ends most searches at a small price; the few that it does not go on with a block twice as wide.
-NARROW_RESTARTS = 5
-RESTARTS = 60
+# A narrow block ends most searches at a small price. The few that it does not are left to the full decomposition,
+# or, where the matrix is large, go on with a block twice as wide.
+FEW_RESTARTS, NARROW_RESTARTS, RESTARTS = 2, 5, 60
+LARGEST_SIDE = 512  # shorter side of a matrix that is decomposed in full after all
 OVERSAMPLING = 5
-# Residual, in units of eps * the largest singular value, at which iteration stops: that of LAPACK.
-RESIDUAL = 30.0
+# Residual at which iteration stops: that of LAPACK, in units of eps times the largest singular value, or one that is
+# as good as none beside the noise, in units of the first discarded singular value.
+RESIDUAL, UNSEEN = 30.0, 1e-8
 CG_STEPS = 300
 ROUGH_RESTARTS = 2
 BLOCK_ELEMENTS = 4096  # of a block of rows in a QR factorization
@@ -108,10 +112,7 @@ def leading_values(operator: LinearOperator, count: int) -> Float[Array, " count
         count: how many.
     """
     width = min(count + OVERSAMPLING, *operator.shape)
-    state = _start(operator, width)
-    for _ in range(ROUGH_RESTARTS):
-        state = _expand(operator, state, width)
-    return state.values[:count]
+    return _restart(operator, _start(operator, width), count, width, ROUGH_RESTARTS).values[:count]
 
 
 def _cg(product: Callable[[Array], Array], right_side: Array) -> Array:
@@ -231,20 +232,42 @@ def _widen(operator: LinearOperator, state: _State, width: int) -> _State:
 
 def _iterate(operator: LinearOperator, order: int) -> Subspace:
     narrow, wide = (min(k * (order + OVERSAMPLING), *operator.shape) for k in (1, 2))
+    small = min(operator.shape) <= LARGEST_SIDE and operator.shape[0] * operator.shape[1] <= LARGEST_DENSE
     state = _start(operator, narrow)
     kept = len(state.values)
-    for width, restarts in ((narrow, NARROW_RESTARTS), (wide, RESTARTS)):
-        if width > narrow:
-            state = _widen(operator, state, width)
-        state = _restart(operator, state, order, width, restarts)
+    state = _restart(operator, state, order, narrow, FEW_RESTARTS if small else NARROW_RESTARTS)
+    if small:
+        state = _in_full(operator, state, order, narrow)
+    elif wide > narrow:
+        state = _restart(operator, _widen(operator, state, wide), order, wide, RESTARTS)
     return Subspace(state.left[:, :order], state.right[:, :order], state.values[:kept])
 
 
 def _restart(operator: LinearOperator, state: _State, order: int, width: int, restarts: int) -> _State:
-    """Restarts until the residual of the kept triplets is rounding."""
-    tolerance = RESIDUAL * jnp.finfo(state.image.dtype).eps
+    """Restarts until the residual of the kept triplets is rounding, or nothing beside the noise."""
 
     def unfinished(state: _State) -> Array:
-        return (state.count < restarts) & (_residual(state, order) > tolerance)
+        return (state.count < restarts) & _coarse(state, order)
 
     return jax.lax.while_loop(unfinished, lambda st: _expand(operator, st, width), state)
+
+
+def _coarse(state: _State, order: int) -> Array:
+    least = RESIDUAL * jnp.finfo(state.image.dtype).eps
+    noise = state.values[order] / jnp.maximum(state.values[0], jnp.finfo(state.image.dtype).tiny)
+    return _residual(state, order) > jnp.maximum(least, UNSEEN * noise)
+
+
+def _in_full(operator: LinearOperator, state: _State, order: int, width: int) -> _State:
+    """The full decomposition where the restarts did not suffice: a loop of one step, skipped when no state needs it."""
+
+    def decompose(state: _State) -> _State:
+        one = jnp.eye(operator.shape[1], dtype=state.image.dtype)
+        # made to depend on the state, or XLA takes all this out of the loop and does it always
+        u, s, vt = svd(operator.mv(jnp.where(state.count < RESTARTS, one, 0.0)))
+        right = vt[:width].T
+        return _State(
+            u[:, :width], s[: len(state.values)], right, u[:, :width] * s[:width], jnp.array(RESTARTS)
+        )
+
+    return jax.lax.while_loop(lambda st: _coarse(st, order) & (st.count < RESTARTS), decompose, state)
