@@ -1,6 +1,7 @@
 """ERA by jaxsid: from an impulse response to a state matrix, as a caller of the library gets it."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -9,7 +10,8 @@ from era_cases import CASES, Case
 import jaxsid
 
 jax.config.update("jax_enable_x64", True)
-BATCH = 16  # realizations side by side, as in jaxsid.ensemble
+CORES = 2  # that share an ensemble, one realization at a time each, as jaxsid.ensemble does it
+POOL = ThreadPoolExecutor(CORES)
 
 METHODS = {"jaxsid": "fast", "jaxsid, full decomposition": "svd"}
 
@@ -20,11 +22,12 @@ def state_matrix(h: jax.Array, case: Case, method: str) -> jax.Array:
 
 
 def task(tool: str, name: str, responses: np.ndarray) -> Callable[[], np.ndarray]:
-    """What is timed, from numpy arrays to numpy arrays: one realization, or all of them in one program."""
+    """What is timed, from numpy arrays to numpy arrays: one realization, or all of them, shared by the cores."""
     case, method = CASES[name], METHODS[tool]
     if case.together:
-        every = jax.jit(lambda h: jax.lax.map(lambda x: state_matrix(x, case, method), h, batch_size=BATCH))
-        return lambda: np.asarray(every(responses))
+        every = jax.jit(lambda h: jax.lax.map(lambda x: state_matrix(x, case, method), h))
+        shares = np.split(responses, CORES)
+        return lambda: np.concatenate(list(POOL.map(lambda h: np.asarray(every(h)), shares)))
     return lambda: np.asarray(state_matrix(responses[0], case, method))[None]
 
 

@@ -112,7 +112,7 @@ def rates_table(rates: dict) -> list[str]:
             lines.append((f"the same, over the first column: {words}", [x / here for x in found]))
     for count in rates["memory"]:
         peaks = [x["memory"][count] for x in columns]
-        lines.append((f"memory of {count} realizations above that of the first chunk, MB", peaks))
+        lines.append((f"memory of {count} realizations above that of the first chunks, MB", peaks))
     for words in rates["delta method"]:
         lines.append((f"delta method: {words}", [x["delta method"][words] for x in columns]))
     return rows + [f"| {words} | " + " | ".join(map(number, values)) + " |" for words, values in lines]

@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 KEY = jax.random.key(0)
 NOISE = 0.01  # of the root mean square of the impulse response past its feedthrough
 MONTE_CARLO = 10_000
-MEMORY_COUNTS, MEMORY_CHUNK = (256, 4096), 256
+MEMORY_COUNTS, MEMORY_CHUNK = (256, 4096), 64
 ONE_POOL = {"MALLOC_ARENA_MAX": "1"}  # a pool of memory for each thread fills by chance, whatever the count
 LATENCY_CALLS = 200
 
@@ -39,7 +39,7 @@ class Chain(NamedTuple):
         samples: of the impulse response.
         blocks: block rows, and block columns, of the Hankel matrix.
         stride: samples between them.
-        count: realizations timed, after a chunk that does not count.
+        count: realizations; the first chunks, which compile, are not timed.
         chunk: see jaxsid.ensemble.
     """
 
@@ -66,8 +66,8 @@ class Chain(NamedTuple):
 
 
 CHAINS = {
-    "200 samples, Hankel of 40 x 40 blocks": Chain(0.1, 201, 40, 2, 4096, 1024),
-    "case C: 201 samples, Hankel of 100 x 100 blocks": Chain(0.02, 201, 100, 1, 1024, 256),
+    "200 samples, Hankel of 40 x 40 blocks": Chain(0.1, 201, 40, 2, 5120, 256),
+    "case C: 201 samples, Hankel of 100 x 100 blocks": Chain(0.02, 201, 100, 1, 1280, 128),
 }
 USUAL = next(iter(CHAINS.values()))
 
@@ -84,27 +84,28 @@ def matrices_and_modes(realization: jaxsid.Realization) -> dict[str, jax.Array]:
 
 
 def rate(chain: Chain) -> float:
-    """Realizations a second once the program is compiled: from the end of the first chunk to that of the last."""
-    ends: list[float] = []
+    """Realizations a second once the program is compiled: from the end of the first chunks to that of the last."""
+    seen: list[tuple[int, float]] = []
     jaxsid.ensemble(
         chain.experiment(matrices),
         KEY,
-        chain.count + chain.chunk,
+        chain.count,
         chunk=chain.chunk,
-        progress=lambda _: ends.append(time.perf_counter()),
+        progress=lambda done: seen.append((done, time.perf_counter())),
     )
-    return chain.count / (ends[-1] - ends[0])
+    (few, begin), (every, end) = seen[0], seen[-1]
+    return (every - few) / (end - begin)
 
 
 def ensemble_peak(count: int) -> float | None:
-    """Highest memory of an ensemble above that after its first chunk, which compiles, MB."""
+    """Highest memory of an ensemble above that after its first chunks, which compile, MB."""
     if not STATUS.exists():
         return None
     start: list[float] = []
     jaxsid.ensemble(
         USUAL.experiment(matrices),
         KEY,
-        count + MEMORY_CHUNK,
+        count,
         chunk=MEMORY_CHUNK,
         progress=lambda _: start or start.append(start_peak()),
     )
@@ -112,7 +113,7 @@ def ensemble_peak(count: int) -> float | None:
 
 
 def memory() -> dict[str, float | None]:
-    """For each number of realizations after the first chunk, in a process of its own."""
+    """For each number of realizations, in a process of its own."""
     peaks = {}
     for count in MEMORY_COUNTS:
         command = [sys.executable, __file__, "--memory", str(count)]
