@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedFormatter, FixedLocator, FuncFormatter
 
 from jaxsid.report.numbers import minus
-from jaxsid.report.study_layout import Panel, is_number, kinds, level_text, levels, pooled, relative
+from jaxsid.report.study_layout import MANY, Panel, is_number, kinds, level_text, levels, pooled, relative
 from jaxsid.report.style import (
     BLUE,
     FONT,
@@ -62,14 +62,16 @@ def spread_figure(panel: Panel, across: str, apart: str | None) -> Figure:
 def _spread(ax: Axes, rows: Sequence[Row], across: str, apart: str | None) -> None:
     places = levels(rows, across)
     x = _axis(ax, places)
+    line = 1.2 if len(places) <= MANY else 0  # cases drawn at random lie on no line
     at = [[row for row in rows if row.factors[across] == place] for place in places]
     for (colour, marker), level in zip(LOOKS, levels(rows, apart) or [None], strict=False):
         y = [pooled([r for r in some if apart is None or r.factors[apart] == level], "std") for some in at]
         name = "estimated" if level is None else level_text(level)
-        ax.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
+        ax.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=line, label=name)
     bound = [pooled(some, "cramer_rao") for some in at]
     if np.isfinite(bound).any():
-        ax.plot(x, bound, color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="Cramér-Rao")
+        look: dict[str, Any] = {"linestyle": (0, (4, 2))} if line else {"linestyle": "none", "marker": "_"}
+        ax.plot(x, bound, color=INK, linewidth=1.2, label="Cramér-Rao", **look)
     log_scale(ax, "y")
 
 
@@ -78,12 +80,12 @@ def _axis(ax: Axes, places: Sequence[Level]) -> list[float]:
     numbers = [float(x) for x in places if is_number(x)]
     x = numbers if len(numbers) == len(places) else [float(i) for i in range(len(places))]
     if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 3:
-        ax.set_xscale("log")
+        log_scale(ax, "x")
     else:
         ax.set_xlim(min(x) - 0.15 * (np.ptp(x) or 1), max(x) + 0.15 * (np.ptp(x) or 1))
-    ax.xaxis.set_major_locator(FixedLocator(x))
-    ax.xaxis.set_major_formatter(FixedFormatter([level_text(place) for place in places]))
-    ax.xaxis.set_minor_locator(NullLocator())
+    if len(places) <= MANY:
+        ax.xaxis.set_major_locator(FixedLocator(x))
+        ax.xaxis.set_major_formatter(FixedFormatter([level_text(place) for place in places]))
     return x
 
 

@@ -10,6 +10,7 @@ from jaxsid.study.summary import Row
 
 ACROSS = ("noise", "samples", "record_samples", "rows", "cols", "order")  # preferred along the axis
 APART = ("realization", "method", "colour")  # preferred as lines
+MANY = 8  # levels of a factor, beyond which it was drawn from a range
 OWN_FIGURE = ("system",)  # what was estimated differs, so that no axis is shared
 
 
@@ -29,13 +30,18 @@ class Panel(NamedTuple):
 
 
 def layout(rows: Sequence[Row], varied: Sequence[str]) -> Layout:
-    """A number that was varied along the axis, noise first; a choice as lines; the rest apart."""
+    """A number that was varied along the axis, noise first; a choice as lines; the rest apart.
+
+    Numbers drawn from a range can only run along the axis: those that do not are left to the tables.
+    """
     free = [name for name in varied if name not in OWN_FIGURE]
     numbers = [name for name in free if all(is_number(x) for x in levels(rows, name))]
     across = _first(numbers, ACROSS) or _first(free, APART)
     free = [name for name in free if name != across]
+    free = [name for name in free if len(levels(rows, name)) <= MANY]
     apart = _first([name for name in free if name not in numbers], APART) or _first(free, APART)
-    return Layout(across, apart, tuple(name for name in varied if name not in (across, apart)))
+    own = [name for name in varied if name in free or name in OWN_FIGURE]
+    return Layout(across, apart, tuple(name for name in own if name != apart))
 
 
 def _first(names: Sequence[str], preferred: Sequence[str]) -> str | None:
@@ -47,11 +53,11 @@ def is_number(value: Level) -> bool:
 
 
 def levels(rows: Sequence[Row], factor: str | None) -> list[Level]:
-    """Values of a factor, numbers in their order, others as they come."""
+    """Values of a factor, numbers in their order, others by name, so that all figures give them the same colours."""
     if factor is None:
         return []
-    found = list(dict.fromkeys(row.factors[factor] for row in rows))
-    return sorted(found, key=float) if all(is_number(x) for x in found) else found
+    found = {row.factors[factor] for row in rows}
+    return sorted(found, key=float if all(is_number(x) for x in found) else str)
 
 
 def panels(rows: Sequence[Row], factors: Sequence[str]) -> list[Panel]:
@@ -60,7 +66,10 @@ def panels(rows: Sequence[Row], factors: Sequence[str]) -> list[Panel]:
     for row in rows:
         parts.setdefault(tuple(row.factors[name] for name in factors), []).append(row)
     return [
-        Panel(", ".join(named(name, x) for name, x in zip(factors, key, strict=True)), tuple(part))
+        Panel(
+            ", ".join(named(name, x) for name, x in zip(factors, key, strict=True)) or "All cases",
+            tuple(part),
+        )
         for key, part in parts.items()
     ]
 

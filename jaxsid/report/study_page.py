@@ -23,6 +23,7 @@ from jaxsid.report.frame import (
 from jaxsid.report.numbers import MISSING, TIMES, percent, plural, significant, with_std
 from jaxsid.report.study_figures import quantile_figure, spread_figure
 from jaxsid.report.study_layout import (
+    MANY,
     Layout,
     cases,
     failed_share,
@@ -46,8 +47,7 @@ REFERENCES = (
     Link("S. M. Kay, Fundamentals of Statistical Signal Processing: Estimation Theory, chapter 3 (1993)"),
     Link(
         "J.-N. Juang and R. S. Pappa, Effects of noise on modal parameters identified by the eigensystem realization "
-        "algorithm, J. Guidance 9 (1986)",
-        "https://doi.org/10.2514/3.20106",
+        "algorithm, J. Guidance 9 (1986)"
     ),
 )
 
@@ -80,7 +80,7 @@ def study_page(study: Study, rows: Sequence[Row]) -> str:
 def _findings(study: Study, rows: Sequence[Row]) -> Section:
     comparisons = compare_levels(rows, study.varied)
     blocks: list[Block] = [Cards(_cards(study, rows)), _failures(study, rows)]
-    blocks += [Text(_verdict(factor, comparisons)) for factor in study.varied]
+    blocks += [Text(text) for text in _verdicts(study.varied, comparisons)]
     return Section("Key findings", (*blocks, *([_comparison_table(comparisons)] if comparisons else [])))
 
 
@@ -94,7 +94,7 @@ def _cards(study: Study, rows: Sequence[Row]) -> tuple[Card, ...]:
         bound = (significant(statistics.median(ratios), 3), span)
     return (
         Card("Realizations", str(study.realizations * len(study.cases)), plural(len(study.cases), "case")),
-        Card("Quantities", str(len(rows)), "summaries, all in summary.csv"),
+        Card("Summaries", str(len(rows)), "one for each case and quantity, in summary.csv"),
         Card("Spread over the Cramér-Rao bound", bound[0], f"median; {bound[1]}" if ratios else bound[1]),
         Card("Most failures", percent(share), f"case {worst[0].case}" if share else "none failed"),
     )
@@ -109,7 +109,7 @@ def _failures(study: Study, rows: Sequence[Row]) -> Notice:
         if failed_share(case) >= FAILING
     )
     if not messages:
-        return Notice(f"No case failed in {percent(FAILING)} of its realizations or more.", (), "good")
+        return Notice("In every case at least 99 % of the realizations gave values.", (), "good")
     return Notice("Failures: the numbers below hold for what succeeded", messages)
 
 
@@ -119,16 +119,21 @@ def _where(study: Study, row: Row) -> str:
     return f" ({words})" if words else ""
 
 
-def _verdict(factor: str, comparisons: Sequence[Comparison]) -> str:
-    """The findings about a factor in plain words."""
-    found = [entry for entry in comparisons if entry.factor == factor]
-    if not found:
-        return (
-            f"{factor.capitalize()}: no two cases differ in this alone and have the same truth, so its levels are not "
-            "compared; see the figures."
+def _verdicts(varied: Sequence[str], comparisons: Sequence[Comparison]) -> list[str]:
+    """The findings about each factor in plain words; last, those about which there are none."""
+    texts, left_out = [], []
+    for factor in varied:
+        found = [entry for entry in comparisons if entry.factor == factor]
+        if found:
+            best = f"{factor.capitalize()}: {level_text(found[0].best)} has the smallest errors."
+            texts.append(" ".join([best, *map(_against, found)]))
+        else:
+            left_out.append(factor)
+    if left_out:
+        texts.append(
+            f"Not compared: {', '.join(left_out)}, for no two cases differ in one of these alone and share the truth."
         )
-    best = level_text(found[0].best)
-    return f"{factor.capitalize()}: {best} has the smallest errors. " + " ".join(_against(x) for x in found)
+    return texts
 
 
 def _against(entry: Comparison) -> str:
@@ -170,7 +175,7 @@ def _spread_section(rows: Sequence[Row], plan: Layout) -> Section:
     every = panels(rows, plan.panels)
     note = (
         "Standard deviation over the size of the truth, geometric mean over the quantities of a kind. No unbiased "
-        "estimator lies below the dashed line; the distance from it is what better processing could gain."
+        "estimator lies below the dashes; the distance from it is what better processing could gain."
     )
     pictures = tuple(
         picture(
@@ -189,6 +194,8 @@ def _left_out(there: int, most: int) -> tuple[Text, ...]:
 def _quantile_section(rows: Sequence[Row], plan: Layout) -> Section:
     """Bars for the levels of one factor; where a number runs along the axis of the spread, at its largest value."""
     numeric = plan.across is not None and all(is_number(x) for x in levels(rows, plan.across))
+    if len(levels(rows, plan.across)) > MANY:
+        return Section("Estimates around the truth", ())
     apart = plan.apart if numeric or plan.apart is not None else plan.across
     apart_by = tuple(x for x in (*plan.panels, plan.across) if x not in (None, apart))
     shown = [

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
@@ -83,7 +84,10 @@ def print_study(study: Study, rows: Sequence[Row], console: Console | None = Non
     """One line a case: spread of each kind of quantity over the truth, and failures; on standard output."""
     console = Console() if console is None else console
     every, names = cases(rows), kinds(rows)
-    table = Table(title=escape(study.name), title_justify="left", title_style="bold", header_style="dim")
+    table = Table(
+        title=escape(study.name), title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
     table.add_column("case", overflow="fold")
     for column in (*(name.replace("_", " ") for name in names), "failed"):
         table.add_column(column, justify="right")

@@ -24,8 +24,8 @@ from jaxsid.compilation import default_folder, keep_programs
 from jaxsid.study.engine import Done, Estimator, Execute, Job, realizations
 from jaxsid.study.store import versions
 
-AHEAD = 3  # jobs given out for each worker, so that none waits for the next
-FEWEST = 8  # workers that jobs are given out for, even while fewer are there
+AHEAD = 3  # jobs given out for each thread of a worker, so that none waits for the next
+FEWEST = 8  # threads that jobs are given out for, even while fewer are there
 LIVES = 3  # times that a job is given out anew after dask gave it up, since worker after worker died over it
 FAILURES = 10  # workers that may die over a job before dask gives it up
 
@@ -151,16 +151,16 @@ class _Out:
 
     def more(self) -> list[Future]:
         """New jobs, as many as the workers that are there now want."""
-        most = AHEAD * max(self._workers(), FEWEST)
+        most = AHEAD * max(self._threads(), FEWEST)
         new = []
         while len(self.given) < most and (job := next(self.jobs, None)) is not None:
             new.append(self.submit(job, LIVES))
         return new
 
-    def _workers(self) -> int:
+    def _threads(self) -> int:
         there = self.client.nthreads()
         assert isinstance(there, dict)  # a coroutine for asynchronous clients only
-        return len(there)
+        return sum(there.values())
 
     def submit(self, job: Job, lives: int) -> Future:
         if self.packed[0] is not job.experiment:

@@ -11,7 +11,7 @@ STEP = np.sqrt(12.0)  # of a converter, in standard deviations of its error
 
 
 def disturbed(
-    y: Float[Array, "samples ..."], deviation: Float[Array, "samples ..."], key: Array, colour: str
+    y: Float[Array, "samples ..."], deviation: Float[Array, "..."], key: Array, colour: str
 ) -> Float[Array, "samples ..."]:
     """The samples y with one realization of noise of a standard deviation for each.
 
