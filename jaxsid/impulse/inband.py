@@ -72,8 +72,8 @@ def observer_response(lines: Lines, *, samples: int = 200, lags: int | None = No
     h = np.zeros((samples, lines.y.shape[1], lines.u.shape[1]))
     noise, orders = np.zeros(lines.y.shape[1]), []
     for outputs in output_groups(lines):
-        largest = _largest_lags(lines, outputs, lags)
-        h[:, outputs], noise[outputs], order = _observer(lines, as_array(outputs), pole, largest, samples)
+        largest = largest_lags(lines, outputs, lags)
+        h[:, outputs], noise[outputs], order = observer(lines, as_array(outputs), pole, largest, samples)
         orders.append(int(order))
     low, high = np.asarray(lines.band).tolist()
     words = f"in-band observer, {low:.3g} to {high:.3g} Hz, {max(orders)} lags"
@@ -89,8 +89,8 @@ def output_groups(lines: Lines) -> list[np.ndarray]:
     return [np.flatnonzero(group.ravel() == g) for g in range(group.max() + 1)]
 
 
-def _largest_lags(lines: Lines, outputs: np.ndarray, lags: int | None) -> int:
-    """As many lags as were asked for, or as the data and the cost allow."""
+def largest_lags(lines: Lines, outputs: np.ndarray, lags: int | None) -> int:
+    """As many lags as were asked for, or as the data and the cost allow; of lines with values."""
     width = len(outputs) + lines.u.shape[1] + lines.record.shape[1]
     equations = 2 * int((np.asarray(lines.weight)[:, outputs].min(axis=1) > 0).sum())
     affordable = min(equations // 3 // width, max(MOST_COLUMNS // width, 2), 40)
@@ -103,10 +103,18 @@ def _largest_lags(lines: Lines, outputs: np.ndarray, lags: int | None) -> int:
 
 
 @compiled
-def _observer(
+def observer(
     lines: Lines, outputs: Int[Array, " m"], pole: Array, largest: int, samples: int
 ) -> tuple[Float[Array, "samples m r"], Float[Array, " m"], Int[Array, ""]]:
-    """Observer by one QR factorization that serves every order; the order by Akaike's criterion."""
+    """Markov parameters, noise and order of the observer: one QR factorization for all orders, Akaike's choice.
+
+    Args:
+        lines: values, or traced.
+        outputs: which, measured in the same records.
+        pole: of the Laguerre shift.
+        largest: order tried.
+        samples: number of Markov parameters.
+    """
     y, weight = lines.y[:, outputs], lines.weight[:, outputs].min(axis=1)
     m, r = len(outputs), lines.u.shape[1]
     y_scale, u_scale = _mean_size(y, weight), _mean_size(lines.u, weight)

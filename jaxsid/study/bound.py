@@ -5,9 +5,10 @@ g(theta) has at least the variance g' (J' S^-1 J)^+ g. The noise of each output 
 known colour, so that S^-1/2 is a filter in time (`whitened`); quantization counts as white noise of variance q^2 / 12.
 
 What is unknown: of a system of bodies the symmetric matrices M, D, K (no springs or dampers on free motion), the
-places of inputs and sensors being known; of a structure given by its modes the poles, and of each mode a complex shape
-at the sensors, a complex participation of the inputs, and the feedthrough of the whole. Quantities that the samples do
-not determine, such as masses without a sensor, have no bound: NaN.
+places of inputs and sensors being known; of a structure given by its modes, for each mode that is excited well, the
+pole, a complex shape at the sensors and a complex participation of the inputs, and the feedthrough of the whole; the
+weak modes count as known. Quantities that the samples do not determine, such as masses without a sensor, have no
+bound: NaN. A biased estimator may scatter less.
 
 Source: S. Kay, Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, ch. 3.
 """
@@ -206,20 +207,17 @@ def _by_modes(system: System, sampling: Sampling) -> tuple[np.ndarray, np.ndarra
     columns = columns - known @ (known.T @ columns)
     small = np.linalg.qr(columns - known @ (known.T @ columns), mode="r")
     rows = [small @ _turned(shape[owner]) / d for shape, d in zip(c, sampling.deviation, strict=True)]
-    nearest = np.argmin(np.abs(poles - system.poles[:, None]), axis=1)
-    slopes = np.zeros((len(nearest), 2 * len(owner)), complex)
-    judged = np.arange(len(nearest))
-    slopes[judged, nearest], slopes[judged, len(owner) + nearest] = 1.0, 1.0j
+    slopes = np.hstack([z * np.eye(len(poles), len(owner)) for z in (1.0, 1.0j)])
     return np.concatenate(rows), _pole_rows(system.poles, slopes)
 
 
 def _modes(system: System, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poles in the upper half plane, shapes (outputs, k) of the sampled model, participations (k, inputs)."""
+    """The judged poles, their shapes (outputs, k) in the sampled model and participations (k, inputs)."""
     A, B, C = (np.asarray(getattr(system.model, name)) for name in "ABC")
     poles, vectors = np.linalg.eig(A)
-    upper = np.imag(poles) > 0
-    b, poles = np.linalg.solve(vectors, B)[upper], poles[upper]
-    return poles, (C @ vectors)[:, upper] * (np.expm1(poles * dt) / poles), b
+    chosen = np.argmin(np.abs(poles - system.poles[:, None]), axis=1)
+    b, poles = np.linalg.solve(vectors, B)[chosen], poles[chosen]
+    return poles, (C @ vectors)[:, chosen] * (np.expm1(poles * dt) / poles), b
 
 
 def _decays(poles: np.ndarray, sampling: Sampling) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ data               "impulse": noise on the Markov parameters themselves; "record
 rate               sampling rate, Hz                                                           the system's
 samples            of the impulse response that is realized                                    the system's
 record_samples     of each record, one record for each input, driven alone from rest           8 samples
-excitation         "multisine" (random phases, up to 0.4 rate), "white", "chirp"               "multisine"
+excitation         "multisine" (random phases, all frequencies), "white", "chirp"              "multisine"
 excitation_seed    of the excitation, which is the same in all realizations                    the study's seed
 noise              standard deviation over the rms of each output (over all samples and
                    inputs)                                                                     0.01
@@ -42,9 +42,9 @@ rows, cols         block rows and columns of the Hankel matrix                  
                                                                                                and half; ERA/DC: few
                                                                                                rows, else columns
 stride             samples between neighbouring blocks                                         1
-lags               block rows and columns of the correlation matrix, ERA/DC only               samples / 6
+lags               block rows and columns of the correlation matrix, ERA/DC only               up to samples / 6
 first_lag          of the correlations                                                         rows
-lag_step           samples between lags                                                        1
+lag_step           samples between lags                                                        1, or to span that
 =================  ==========================================================================  =====================
 """
 

@@ -11,11 +11,12 @@ from jaxsid.mechanics.simulate import impulse_response_of
 from jaxsid.realization.era import era
 from jaxsid.realization.era_dc import era_dc
 from jaxsid.records import ImpulseResponse, Realization
-from jaxsid.study.bound import Sampling, cramer_rao
+from jaxsid.study.bound import Sampling, cramer_rao, driven
 from jaxsid.study.configuration import Case
 from jaxsid.study.factors import resolve
 from jaxsid.study.noise import disturbed
 from jaxsid.study.quantities import Structure, estimates, names_and_units, split, structure_of, truth_of
+from jaxsid.study.records import METHODS, Observer, excitation, one_after_another, prepare_observer
 from jaxsid.study.system import make_system
 
 
@@ -23,6 +24,7 @@ class Plan(eqx.Module):
     """How an experiment is evaluated: the static numbers and words of a case."""
 
     colour: str = eqx.field(static=True)
+    method: str = eqx.field(static=True)
     realization: str = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     order: int = eqx.field(static=True)
@@ -43,9 +45,11 @@ class Experiment(eqx.Module):
         bound: Cramer-Rao bound of their standard deviations, NaN where there is none.
         exact: samples without noise, (samples, outputs, inputs): Markov parameters, or for each input the response
             to the excitation of that input alone.
+        excitation: (samples,), None where the Markov parameters themselves are measured.
         deviation: of the noise on each output, (outputs, 1).
         dt: s.
         swings, still: true poles that are judged, oscillating and real, 1/s.
+        observer: prepared for the method "inband".
         structure: what CBSI needs, None where there are no matrices.
         plan: the static rest.
     """
@@ -55,6 +59,8 @@ class Experiment(eqx.Module):
     truth: Float[Array, " q"]
     bound: Float[Array, " q"]
     exact: Float[Array, "samples outputs inputs"]
+    excitation: Float[Array, " samples"] | None
+    observer: Observer | None
     deviation: Float[Array, "outputs 1"]
     dt: Float[Array, ""]
     swings: Complex[Array, " k"]
@@ -69,8 +75,21 @@ class Experiment(eqx.Module):
             key: of the realization.
         """
         samples = disturbed(self.exact, self.deviation, key, self.plan.colour)
-        response = ImpulseResponse(samples, self.dt)
-        return estimates(realize(response, self.plan), self.swings, self.still, self.structure)
+        realization = realize(self.response(samples), self.plan)
+        return estimates(realization, self.swings, self.still, self.structure)
+
+    def response(self, y: Float[Array, "samples outputs inputs"]) -> ImpulseResponse:
+        """The impulse response that measured samples give.
+
+        Args:
+            y: like `exact`.
+        """
+        if self.excitation is None:
+            return ImpulseResponse(y, self.dt)
+        if self.observer is not None:
+            return self.observer(y, self.plan.samples)
+        records = one_after_another(self.excitation, y, self.dt)
+        return METHODS[self.plan.method](records, self.plan.samples)
 
 
 def realize(response: ImpulseResponse, plan: Plan) -> Realization:
@@ -111,15 +130,25 @@ def make_experiment(case: Case) -> Experiment:
     truth = truth_of(system, structure)
     swings, still = split(system.poles)
     dt = 1 / v["rate"]
-    exact = np.asarray(impulse_response_of(system.model, dt, samples=plan.samples).h)
+    length = v["record_samples"] or plan.samples
+    u = excitation(v["excitation"], length, v["excitation_seed"]) if v["excitation"] else None
+    exact = driven(np.asarray(impulse_response_of(system.model, dt, samples=length).h), u)
     size = np.sqrt(np.mean(exact**2, axis=(0, 2)))
-    least = cramer_rao(system, structure, Sampling(dt, plan.samples, None, size, plan.colour))
+    least = cramer_rao(system, structure, Sampling(dt, length, u, size, plan.colour))
+    inband = plan.method == "inband"
+    observer = (
+        prepare_observer(one_after_another(jnp.asarray(u), jnp.asarray(exact), jnp.asarray(dt)))
+        if inband
+        else None
+    )
     return Experiment(
         names,
         units,
         truth=jnp.asarray(truth),
         bound=jnp.asarray(v["noise"] * least),
         exact=jnp.asarray(exact),
+        excitation=None if u is None else jnp.asarray(u),
+        observer=observer,
         deviation=jnp.asarray(v["noise"] * size[:, None]),
         dt=jnp.asarray(dt),
         swings=jnp.asarray(swings),

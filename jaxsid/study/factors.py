@@ -14,7 +14,7 @@ Value = str | int | float | bool
 METHODS = ("fourier", "direct", "wavelet", "inband")
 EXCITATIONS = ("multisine", "white", "chirp")
 ORDER = re.compile(r"true(\+\d+)?")
-MOST_ROWS = 200  # of a Hankel matrix that nobody asked to be larger
+MOST_ROWS = 400  # of a Hankel matrix that nobody asked to be larger
 RECORD_LENGTH = 8  # times the length of the impulse response
 
 
@@ -146,12 +146,18 @@ def _era_window(v: dict[str, Any], system: System) -> dict[str, Any]:
 
 
 def _era_dc_window(v: dict[str, Any], system: System) -> dict[str, Any]:
-    """Few rows, the first lag behind them, lags over a third of the samples, and columns for the rest."""
+    """Few rows, the first lag behind them, lags over a third of the samples, and columns for the rest.
+
+    Where that makes more than MOST_ROWS the lags are fewer, and further apart, but by no more than the rows bridge.
+    """
     outputs, inputs = system.model.C.shape[0], system.model.B.shape[1]
-    step, stride = v.get("lag_step") or 1, v["stride"]
-    rows = v.get("rows") or max(-(-v["order"] // outputs), 2 if outputs < MOST_ROWS // 4 else 1)
+    stride, third = v["stride"], v["samples"] // 6
+    rows = v.get("rows") or max(-(-v["order"] // outputs), 2 if outputs < MOST_ROWS // 8 else 1)
     first = v.get("first_lag", rows * stride)
-    lags = v.get("lags") or max(v["samples"] // (6 * step), 2)
+    least = max(-(-v["order"] // (rows * outputs)), 3)
+    most = max(min(third // (v.get("lag_step") or 1), MOST_ROWS // (rows * outputs)), least)
+    lags = v.get("lags") or most
+    step = v.get("lag_step") or max(min(third // lags, rows), 1)
     reach = 2 + stride * (rows - 2) + first + 2 * (lags - 1) * step
     cols = v.get("cols") or max((v["samples"] - 1 - reach) // stride, 1)
     check_reach(reach + stride * cols, v["samples"])

@@ -47,7 +47,7 @@ BUILT_IN = {
     "chain3": BuiltIn(three_dof, 4.0, 120),
     "chain7": BuiltIn(lambda: chain(7), 12.0, 120),
     "rig": BuiltIn(rig, 1000.0, 200, ROTATION),
-    "mini_mast": BuiltIn(mini_mast, 80.0, 400),
+    "mini_mast": BuiltIn(mini_mast, 50.0, 300),
     "galileo": BuiltIn(galileo, 102.4, 512),
     "railway_vehicle": BuiltIn(railway_vehicle, 40.0, 120),
     "turbine_generator": BuiltIn(turbine_generator, 160.0, 320, ROTATION),
