@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, FuncFormatter
 
 from jaxsid.report.numbers import minus
-from jaxsid.report.study_layout import MANY, Panel, is_number, kinds, level_text, levels, pooled, relative
+from jaxsid.report.study_layout import Panel, is_number, kinds, level_text, levels, pooled, relative
 from jaxsid.report.style import (
     BLUE,
     FONT,
@@ -23,7 +23,7 @@ from jaxsid.report.style import (
     new_figure,
     title,
 )
-from jaxsid.study.compare import Level
+from jaxsid.study.compare import MANY, Level
 from jaxsid.study.summary import Row
 
 LOOKS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PINK, "D"), (INK, "v"), (MUTED, "P"))

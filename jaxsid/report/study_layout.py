@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from jaxsid.report.numbers import minus
-from jaxsid.study.compare import Level
+from jaxsid.study.compare import MANY, Level
 from jaxsid.study.summary import Row
 
 ACROSS = ("noise", "samples", "record_samples", "rows", "cols", "order")  # preferred along the axis
 APART = ("realization", "method", "colour")  # preferred as lines
-MANY = 8  # levels of a factor, beyond which it was drawn from a range
 OWN_FIGURE = ("system",)  # what was estimated differs, so that no axis is shared
 
 

@@ -23,7 +23,6 @@ from jaxsid.report.frame import (
 from jaxsid.report.numbers import MISSING, TIMES, percent, plural, significant, with_std
 from jaxsid.report.study_figures import quantile_figure, spread_figure
 from jaxsid.report.study_layout import (
-    MANY,
     Layout,
     cases,
     failed_share,
@@ -36,8 +35,9 @@ from jaxsid.report.study_layout import (
     panels,
     pooled,
 )
-from jaxsid.study.compare import Comparison, compare_levels
+from jaxsid.study.compare import MANY, SIGNIFICANT, Comparison, compare_levels
 from jaxsid.study.configuration import Study
+from jaxsid.study.effects import Effect, estimate_effects
 from jaxsid.study.summary import Row
 
 SPREAD_FIGURES, QUANTILE_FIGURES = 6, 6
@@ -80,7 +80,7 @@ def study_page(study: Study, rows: Sequence[Row]) -> str:
 def _findings(study: Study, rows: Sequence[Row]) -> Section:
     comparisons = compare_levels(rows, study.varied)
     blocks: list[Block] = [Cards(_cards(study, rows)), _failures(study, rows)]
-    blocks += [Text(text) for text in _verdicts(study.varied, comparisons)]
+    blocks += [Text(text) for text in _verdicts(study, rows, comparisons)]
     return Section("Key findings", (*blocks, *([_comparison_table(comparisons)] if comparisons else [])))
 
 
@@ -119,21 +119,38 @@ def _where(study: Study, row: Row) -> str:
     return f" ({words})" if words else ""
 
 
-def _verdicts(varied: Sequence[str], comparisons: Sequence[Comparison]) -> list[str]:
+def _verdicts(study: Study, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> list[str]:
     """The findings about each factor in plain words; last, those about which there are none."""
     texts, left_out = [], []
-    for factor in varied:
+    for factor in study.varied:
         found = [entry for entry in comparisons if entry.factor == factor]
         if found:
             best = f"{factor.capitalize()}: {level_text(found[0].best)} has the smallest errors."
             texts.append(" ".join([best, *map(_against, found)]))
         else:
             left_out.append(factor)
-    if left_out:
+    effects = [x for x in estimate_effects(rows, study.varied) if x.factor in left_out]
+    silent = [factor for factor in left_out if factor not in {effect.factor for effect in effects}]
+    if silent:
         texts.append(
-            f"Not compared: {', '.join(left_out)}, for no two cases differ in one of these alone and share the truth."
+            f"Not compared: {', '.join(silent)}, for no two cases differ in this alone and share the truth."
         )
-    return texts
+    return texts + [_effect(effect) for effect in effects]
+
+
+def _effect(effect: Effect) -> str:
+    """What a regression over all cases says about a factor."""
+    name, sure = effect.factor.capitalize(), abs(effect.value) > SIGNIFICANT * effect.error
+    note = "" if sure else ", no more than chance explains"
+    if effect.level is None:
+        power = with_std(effect.value, effect.error)
+        return f"{name}: all else being equal, errors go with its power {power}{note}."
+    assert effect.base is not None
+    low, middle, high = (significant(math.exp(effect.value + k * effect.error), 3) for k in (-2, 0, 2))
+    return (
+        f"{name}: all else being equal, errors with {level_text(effect.level)} are {middle} times those with "
+        f"{level_text(effect.base)} (95 %: {low} to {high}){note}."
+    )
 
 
 def _against(entry: Comparison) -> str:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from jaxsid.study.summary import Row
 
 SIGNIFICANT = 3.0  # standard errors
+MANY = 8  # levels, beyond which a factor was drawn from a range
 SAME = 1e-6  # relative difference of truths that are one and the same
 Level = str | int | float | bool
 
@@ -34,7 +35,8 @@ def compare_levels(rows: Sequence[Row], varied: Sequence[str]) -> list[Compariso
     """Every level of every varied factor against that factor's best level, where cases allow it.
 
     Two cases are compared, quantity by quantity, where all other varied factors and the truth are the same; so factors
-    that change the truth, such as the system, have no entry, nor have those of a random sweep.
+    that change the truth, such as the system, have no entry, nor have those of a random sweep, nor those
+    with more than eight levels: for these see `estimate_effects`.
 
     Args:
         rows: summary of a study.
@@ -47,7 +49,7 @@ def _compare(rows: Sequence[Row], factor: str, others: set[str]) -> list[Compari
     levels = list(dict.fromkeys(row.factors[factor] for row in rows))
     against_first = [(_against(rows, factor, others, level, levels[0]), level) for level in levels[1:]]
     usable = [(entry.ratio, level) for entry, level in against_first if entry.pairs]
-    if not usable:
+    if not usable or len(levels) > MANY:
         return []
     best = min([(1.0, levels[0]), *usable], key=lambda x: x[0])[1]
     entries = [_against(rows, factor, others, level, best) for level in levels if level != best]
