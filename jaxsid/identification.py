@@ -9,11 +9,18 @@ from jaxsid.records import ContinuousModel, ImpulseResponse, ModalModel, Realiza
 
 
 class MatrixDeviation(eqx.Module):
-    """Standard deviation of every entry of mass, damping and stiffness, (N, N) each."""
+    """Standard deviations of mass, damping and stiffness.
+
+    Attributes:
+        mass, damping, stiffness: of every entry, (N, N).
+        ground_damping, ground_stiffness: of the sum of every row, which is what joins a body to the ground, (N,).
+    """
 
     mass: Float[Array, "N N"]
     damping: Float[Array, "N N"]
     stiffness: Float[Array, "N N"]
+    ground_damping: Float[Array, " N"]
+    ground_stiffness: Float[Array, " N"]
 
 
 class FrequencyFit(eqx.Module):
@@ -50,6 +57,8 @@ class Identification(eqx.Module):
         stabilization: poles over orders.
         modal: poles, shapes and indicators.
         frequency_std, damping_ratio_std: (n,) standard deviations of frequencies (rad/s) and damping ratios.
+        pole_std: (n,) standard deviation of the real part + 1j times that of the imaginary part, 1/s.
+        shape_std: (outputs, n) likewise of the shapes as displacements with largest component 1; NaN without matrices.
         cbsi: mass, damping and stiffness by CBSI alone; None where impossible.
         matrices: mass, damping and stiffness, symmetric, that fit the records best; None where impossible.
         matrices_std: their standard deviations.
@@ -73,6 +82,8 @@ class Identification(eqx.Module):
     modal: ModalModel
     frequency_std: Float[Array, " n"]
     damping_ratio_std: Float[Array, " n"]
+    pole_std: Complex[Array, " n"]
+    shape_std: Complex[Array, "outputs n"]
     cbsi: SecondOrderModel | None
     matrices: SecondOrderModel | None
     matrices_std: MatrixDeviation | None

@@ -63,7 +63,8 @@ def identification(samples: int = 4000) -> Identification:
     )  # fmt: skip
     diagnostics = CbsiDiagnostics(*(jnp.asarray(x) for x in (2e-3, 5e-4, 1e-3, 2e-2, 4e-4, 0.0)))
     deviation = MatrixDeviation(
-        *(0.004 * jnp.abs(x) + 1e-3 * jnp.abs(x).max() for x in (truth.mass, truth.damping, truth.stiffness))
+        *(0.004 * jnp.abs(x) + 1e-3 * jnp.abs(x).max() for x in (truth.mass, truth.damping, truth.stiffness)),
+        *(0.006 * jnp.abs(x).max(axis=1) for x in (truth.damping, truth.stiffness)),
     )
     rest = np.std(y - clean, axis=0) / np.std(y, axis=0)
     return Identification(
@@ -80,6 +81,8 @@ def identification(samples: int = 4000) -> Identification:
         modal=found_modal,
         frequency_std=found_modal.frequencies * 2e-4,
         damping_ratio_std=jnp.full(n, 4e-4),
+        pole_std=(3e-4 + 2e-4j) * found_modal.frequencies,
+        shape_std=jnp.full((3, n), 0.002 + 0.001j),
         cbsi=dataclasses.replace(matrices, diagnostics=diagnostics),
         matrices=matrices,
         matrices_std=deviation,

@@ -146,7 +146,8 @@ def test_many_sensors_and_real_poles():
     nan = jnp.full(n, jnp.nan)
     found = dataclasses.replace(
         found, nominal=nominal, outputs=tuple(s.name for s in sensors), modal=model, frequency_std=nan,
-        damping_ratio_std=nan, matrices=None,
+        damping_ratio_std=nan, pole_std=nan + 0j, matrices=None,
+        shape_std=found.shape_std[:, :n],
     )  # fmt: skip
     assert [mode.real for mode in modes_of(found)] == [True, False]
     assert "real" in plots.mode_shape_figure(found).axes[0].get_title(loc="left")
@@ -161,4 +162,4 @@ def test_elements_are_read_off_the_matrices(found):
     assert connecting(found, "stiffness", ("top", "ground"))[0] == 0
     value, std = connecting(found, "stiffness", ("ground", "base"))
     assert value == pytest.approx(40e3 * 1.001)
-    assert np.isnan(std)
+    assert std == pytest.approx(0.006 * 70e3)

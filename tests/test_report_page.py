@@ -154,6 +154,7 @@ def test_report_with_nothing_but_modes(found):
         records=(record, record), predictions=found.predictions * 2,
         response=ImpulseResponse(found.response.h, 0.005, pole=0.8),
         frequency_std=jnp.full(6, jnp.nan), damping_ratio_std=jnp.full(6, jnp.nan),
+        pole_std=jnp.full(6, jnp.nan + 0j), shape_std=jnp.full((3, 6), jnp.nan + 0j),
     )  # fmt: skip
     reader = Reader(report_page(bare))
     assert "No warnings." in reader.text
@@ -190,7 +191,7 @@ def test_many_sensors_show_the_worst(found):
         without_matrices(found), nominal=nominal, outputs=names, frequency_fit=(),
         records=(Record(record.u, y, record.dt, inputs=("force",), outputs=names),),
         predictions=(jnp.asarray(0.9 * y),), train_nrmse=jnp.linspace(0.01, 0.4, count),
-        noise_floor=jnp.full(count, 0.01),
+        noise_floor=jnp.full(count, 0.01), shape_std=jnp.full((count, 6), 0.01 + 0.01j),
         modal=dataclasses.replace(
             without_matrices(found).modal,
             shapes=jnp.ones((count, 6), complex),

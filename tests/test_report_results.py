@@ -31,7 +31,7 @@ def test_schema_of_the_contract(found, tmp_path):
     assert len(data["modes"]) == 3
     for mode in data["modes"]:
         assert {"frequency_hz", "damping_ratio", "pole", "mac", "emac", "mpc", "msv", "std"} <= set(mode)
-        assert set(mode["std"]) == {"frequency_hz", "damping_ratio"}
+        assert set(mode["std"]) == {"frequency_hz", "damping_ratio", "pole", "shape"}
         assert mode["pole"][1] > 0
         assert mode["frequency_hz"] == pytest.approx(np.hypot(*mode["pole"]) / (2 * np.pi))
         assert mode["damping_ratio"] == pytest.approx(-mode["pole"][0] / np.hypot(*mode["pole"]))
@@ -40,6 +40,10 @@ def test_schema_of_the_contract(found, tmp_path):
     for which in ("mass", "damping", "stiffness"):
         assert np.array_equal(data[which], getattr(found.matrices, which))
         assert np.array_equal(data["std"][which], getattr(found.matrices_std, which))
+    first = data["modes"][0]
+    assert first["std"]["pole"] == [found.pole_std[0].real, found.pole_std[0].imag]
+    assert max(abs(complex(*x)) for x in first["shape"].values()) == pytest.approx(1.0)
+    assert first["std"]["shape"]["acc2"] == [0.002, 0.001]
     assert set(data["fit"]) == {"train_nrmse", "noise_floor"}
     assert data["fit"]["train_nrmse"]["acc3"] == float(found.train_nrmse[2])
     assert data["warnings"] == [WARNING]
@@ -51,7 +55,8 @@ def test_schema_of_the_contract(found, tmp_path):
 def test_what_is_unknown_is_null(found):
     bare = without_matrices(found)
     nan = jnp.full(6, jnp.nan)
-    data = identification_json(dataclasses.replace(bare, frequency_std=nan, damping_ratio_std=nan))
+    unknown = {"pole_std": nan + 0j, "shape_std": jnp.full((3, 6), jnp.nan + 0j)}
+    data = identification_json(dataclasses.replace(bare, frequency_std=nan, damping_ratio_std=nan, **unknown))
     json.dumps(data, allow_nan=False)
     assert data["mass"] is data["damping"] is data["stiffness"] is data["std"] is data["cbsi"] is None
     assert data["modes"][0]["mac"] is data["modes"][0]["std"]["frequency_hz"] is None
@@ -68,8 +73,9 @@ def test_a_real_pole_is_one_mode(found):
         indicators=None,
     )
     few = jnp.full(3, 0.1)
+    spread = {"frequency_std": few, "damping_ratio_std": few, "pole_std": few + 0j}
     data = identification_json(
-        dataclasses.replace(found, modal=modal, frequency_std=few, damping_ratio_std=few)
+        dataclasses.replace(found, modal=modal, shape_std=found.shape_std[:, :3], **spread)
     )
     assert [mode["pole"] for mode in data["modes"]] == [[-3, 0], [-1, 10]]
     assert len(data["poles"]) == 3

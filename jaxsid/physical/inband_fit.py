@@ -3,10 +3,12 @@
 With Z(s) = M s^2 + D s + K, the model of line k is (H_d + s H_v + s^2 H_a) Z(s)^-1 B U_k at s = j w_k, and its
 derivative to any entry of M, D, K is minus an outer product of two solutions with Z, so Jacobians cost little.
 The hold of the inputs is exact: what a sampled system does beyond its continuous-time frequency response,
-G(z) - G_c(s) hold(w), is small and taken from the polished realization. Transients keep the poles of the
-polished realization and free amplitudes, which are projected out.
+G(z) - G_c(s) hold(w), is small and taken from the polished realization. The transients of an output are
+e' (x I - F)^-1 a + b with the system's own F, read at the body of its sensor, and free a and b for each record: they
+are projected out as in variable projection, so that what they tell of the poles counts once.
 
-Source: R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., ch. 9.
+Source: R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., ch. 9; G. Golub
+and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), with L. Kaufman's simplification (BIT 15, 1975).
 """
 
 from typing import NamedTuple
@@ -18,6 +20,7 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
+from jaxsid.mechanics.functions_of_matrices import phi_functions
 from jaxsid.physical.parameterization import Parameterization, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
@@ -29,17 +32,21 @@ class Target(NamedTuple):
 
     Attributes:
         s: (lines,) j w.
+        x: (lines,) where the transients are rational functions: z, or s for band-limited inputs.
+        record: (lines, records) which record a line belongs to.
+        dt: the interval after which F = exp(A dt) for x = z; 0 for x = s, where F = A.
         drive: (lines, inputs) spectrum of the held inputs.
         y: (lines, outputs) measured, less what sampling adds.
         weight: (lines, outputs) one over the noise, 0 where nothing was measured.
-        transient: (2 lines, free, outputs) orthonormal basis of the weighted transients, real over imaginary.
     """
 
     s: Complex[Array, " lines"]
+    x: Complex[Array, " lines"]
+    record: Float[Array, "lines records"]
+    dt: Float[Array, ""]
     drive: Complex[Array, "lines inputs"]
     y: Complex[Array, "lines outputs"]
     weight: Float[Array, "lines outputs"]
-    transient: Float[Array, "twice free outputs"]
 
 
 class MatrixFit(NamedTuple):
@@ -67,7 +74,7 @@ def fit_target(
     realization: Realization,
     model: ContinuousModel,
 ) -> Target:
-    """The lines as continuous-time data, with the transients' basis.
+    """The lines as continuous-time data.
 
     Args:
         lines: in-band lines.
@@ -82,23 +89,10 @@ def fit_target(
     drive = lines.u * jnp.stack([factors[h] for h in lines.hold], axis=1)
     sampled = _modal_response(realization, lines.z, lines.u)
     excess = sampled - _modal_response(model, s, drive)
-    poles = jnp.linalg.eigvals(realization.A)
     weight = lines.weight * jnp.sqrt(2.0) / noise
-    parts = 1 / (lines.z[:, None] - poles)
-    # conjugate pairs: sums and differences over j have real coefficients
-    mirrored = 1 / (lines.z[:, None] - poles.conj())
-    basis = jnp.concatenate([parts + mirrored, 1j * (parts - mirrored), jnp.ones((len(s), 1))], axis=1)
-    basis = (basis[:, :, None] * lines.record[:, None, :]).reshape(len(s), -1)
-    # one output after another: batched factorizations side by side can lock up the CPU's thread pool
-    transient = jax.lax.map(lambda w: _orthonormal(basis * w[:, None]), weight.T)
-    return Target(s, drive, lines.y - excess, weight, jnp.moveaxis(transient, 0, 2))
-
-
-def _orthonormal(x: Array) -> Array:
-    """Orthonormal basis of the real span of complex columns; empty directions become zero."""
-    x = jnp.concatenate([x.real, x.imag])
-    u, sv, _ = jnp.linalg.svd(x / jnp.maximum(jnp.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
-    return u * (sv > 1e-10 * sv[0])
+    band = "band" in lines.hold
+    dt = jnp.zeros_like(lines.dt) if band else lines.dt
+    return Target(s, s if band else lines.z, lines.record, dt, drive, lines.y - excess, weight)
 
 
 def _modal_response(model: Realization | ContinuousModel, points: Array, u: Array) -> Array:
@@ -124,12 +118,14 @@ def fit_matrices(
     def evaluate(theta: Array) -> tuple[Array, Array]:
         matrices, slopes = parameterization.matrices(theta), jax.jacfwd(parameterization.matrices)(theta)
         model, derivative = _lines_and_slopes(target, matrices, slopes, sensed)
-        left = _project(target, (target.y - model)[:, None])[:, 0]
-        return left.ravel(), -jnp.moveaxis(_project(target, derivative), 1, 2).reshape(-1, len(theta))
+        return _without_transients(
+            target, target.y - model, -derivative, *_motion(target, matrices, slopes), sensed
+        )
 
     found = levenberg_marquardt(evaluate, parameterization.unknowns(start), max_steps=STEPS)
     scale = jnp.sqrt(jnp.diag(found.jacobian_product))
-    free = (target.transient**2).sum() + len(found.value)
+    amplitudes = target.record.shape[1] * (2 * len(sensed.mass) + 1) * target.weight.shape[1]
+    free = amplitudes + len(found.value)
     equations = 2 * (target.weight > 0).sum()
     misfit = 2 * found.cost / jnp.maximum(equations - free, 1.0)
     covariance = jnp.linalg.inv(found.jacobian_product / scale / scale[:, None]) / scale / scale[:, None]
@@ -160,8 +156,67 @@ def _lines_and_slopes(
     return model, -jnp.swapaxes(change, 1, 2)
 
 
-def _project(target: Target, x: Array) -> Array:
-    """Weighted real and imaginary parts with transients removed, (2 lines, columns, outputs)."""
-    x = x * target.weight[:, None, :]
-    x = jnp.concatenate([x.real, x.imag])
-    return x - jnp.einsum("kfo,fco->kco", target.transient, jnp.einsum("kfo,kco->fco", target.transient, x))
+def _motion(target: Target, matrices: Triple, slopes: tuple[Array, ...]) -> tuple[Array, Array]:
+    """F, (2N, 2N), and its derivatives to the unknowns, (2N, 2N, p)."""
+
+    def advance(M: Array, D: Array, K: Array) -> Array:
+        per_mass = jnp.linalg.solve(M, jnp.concatenate([-K, -D], axis=1))
+        A = jnp.concatenate([jnp.eye(len(M), 2 * len(M), len(M)), per_mass])
+        # exp(A dt) = I + A dt phi_1(A dt); for dt = 0 the transients are those of continuous time
+        held = jnp.eye(len(A)) + A * target.dt @ phi_functions(A * target.dt)[0]
+        return jnp.where(target.dt > 0, held, A)
+
+    F, push = jax.linearize(advance, *matrices)
+    return F, jax.vmap(push, in_axes=-1, out_axes=-1)(*slopes)
+
+
+def _without_transients(
+    target: Target, left: Array, slopes: Array, F: Array, dF: Array, sensed: SecondOrderModel
+) -> tuple[Array, Array]:
+    """Weighted residual (equations,) and Jacobian (equations, p) with the transients projected out.
+
+    Args:
+        target: the lines.
+        left: (lines, outputs) measured less modelled.
+        slopes: (lines, p, outputs) its derivative.
+        F: of the transients.
+        dF: its derivative.
+        sensed: gives the sensors.
+    """
+    inverse = jnp.linalg.inv(target.x[:, None, None] * jnp.eye(len(F)) - F)
+    places = sensed.displacement_sensors + sensed.velocity_sensors + sensed.acceleration_sensors
+    constant = target.record.astype(inverse.dtype)
+
+    def one_output(given: tuple[Array, ...]) -> tuple[Array, Array]:
+        y, weight, slope, place = given
+        row = jnp.einsum("n,knm->km", place, inverse[:, : len(place)])
+        basis = (row[:, None, :] * target.record[:, :, None]).reshape(len(row), -1)
+        q, amplitude = _amplitudes(
+            _parts(jnp.concatenate([basis, constant], axis=1), weight), _parts(y, weight)
+        )
+        state = amplitude[: basis.shape[1]].reshape(target.record.shape[1], -1)
+        moved = jnp.einsum("knm,km->kn", inverse, target.record @ state)
+        outer = (row[:, :, None] * moved[:, None, :]).reshape(len(row), -1)
+        change = outer @ dF.reshape(-1, dF.shape[-1]).astype(outer.dtype)
+        r, j = _parts(y, weight), _parts(slope - change, weight)
+        return r - q @ (q.T @ r), j - q @ (q.T @ j)
+
+    # one output after another: batched factorizations side by side can lock up the CPU's thread pool
+    r, j = jax.lax.map(one_output, (left.T, target.weight.T, jnp.moveaxis(slopes, 2, 0), places))
+    return r.ravel(), j.reshape(-1, j.shape[-1])
+
+
+def _amplitudes(basis: Array, y: Array) -> tuple[Array, Array]:
+    """Orthonormal basis of real columns and the coefficients of y in the columns; empty directions become zero."""
+    size = jnp.linalg.norm(basis, axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    u, sv, vt = jnp.linalg.svd(basis / size, full_matrices=False)
+    seen = sv > 1e-10 * sv[0]
+    inner = jnp.where(seen, u.T @ y / jnp.where(seen, sv, 1.0), 0.0)
+    return u * seen, vt.T @ inner / size
+
+
+def _parts(x: Array, weight: Array) -> Array:
+    """Weighted real over imaginary parts."""
+    x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
+    return jnp.concatenate([x.real, x.imag])

@@ -109,6 +109,8 @@ def _collect(
         modal=final.modal,
         frequency_std=final.frequency_std,
         damping_ratio_std=final.damping_ratio_std,
+        pole_std=final.pole_std,
+        shape_std=final.shape_std,
         cbsi=found.cbsi,
         matrices=found.model,
         matrices_std=None if found.fit is None else _deviation(found),
@@ -137,7 +139,10 @@ def _not_this_order(system: Setting) -> Found:
 
 def _deviation(found: Found) -> MatrixDeviation:
     assert found.fit is not None
-    return MatrixDeviation(*found.fit.deviation)
+    fit, rows = found.fit, [np.asarray(x).sum(axis=1) for x in found.fit.slopes[1:]]
+    covariance = np.asarray(fit.covariance)
+    sums = [np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", x, covariance, x), 0.0)) for x in rows]
+    return MatrixDeviation(*fit.deviation, *(as_array(x) for x in sums))
 
 
 def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedModel:

@@ -29,13 +29,19 @@ WINDOW = 100  # block rows and columns of the realization of a model's own respo
 
 
 class FinalModes(NamedTuple):
-    """The model that is reported, its modes, and standard deviations of frequencies (rad/s) and damping ratios."""
+    """The model that is reported, its modes, and standard deviations of frequencies (rad/s) and damping ratios.
+
+    Those of poles and shapes are complex, the deviation of the real part + 1j times that of the imaginary part. The
+    shapes are displacements at the sensors, the largest of each 1; their deviations are NaN without matrices.
+    """
 
     realization: Realization
     continuous: ContinuousModel
     modal: ModalModel
     frequency_std: Array
     damping_ratio_std: Array
+    pole_std: Array
+    shape_std: Array
 
 
 def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: MatrixFit | None) -> FinalModes:
@@ -57,16 +63,17 @@ def final_modes(space: StateSpace, matrices: SecondOrderModel | None, fit: Matri
     measured, own = modal(space.measured), modal(realization)
     indicators = _nearest(measured, own)
     own = eqx.tree_at(lambda m: m.indicators, own, indicators, is_leaf=lambda x: x is None)
+    poles = np.asarray(own.poles)
     if matrices is None or fit is None:
-        slopes = _slopes_of_denominators(space, np.asarray(own.poles))
-        covariance = np.asarray(space.polished.pole_covariance)
+        slopes, covariance = _slopes_of_denominators(space, poles), np.asarray(space.polished.pole_covariance)
+        shape = np.full((len(model.C), len(poles)), complex(np.nan, np.nan))
     else:
-        slopes, covariance = (
-            _slopes_of_matrices(matrices, fit, np.asarray(own.poles)),
-            np.asarray(fit.covariance),
-        )
-    frequency, ratio = _deviations(np.asarray(own.poles), slopes, covariance)
-    return FinalModes(realization, model, own, as_array(frequency), as_array(ratio))
+        slopes, covariance = _slopes_of_matrices(fit, poles), np.asarray(fit.covariance)
+        seen = matrices.displacement_sensors + matrices.velocity_sensors + matrices.acceleration_sensors
+        shape = _parts(_slopes_of_shapes(fit, np.asarray(seen), poles, slopes), covariance)
+    frequency, ratio = _deviations(poles, slopes, covariance)
+    deviations = frequency, ratio, _parts(slopes, covariance), shape
+    return FinalModes(realization, model, own, *(as_array(x) for x in deviations))
 
 
 def _minimal(matrices: SecondOrderModel, space: StateSpace) -> Realization:
@@ -91,16 +98,41 @@ def _nearest(measured: ModalModel, own: ModalModel) -> Indicators | None:
     return jax.tree.map(lambda x: as_array(np.asarray(x)[index]), measured.indicators)
 
 
-def _slopes_of_matrices(matrices: SecondOrderModel, fit: MatrixFit, poles: np.ndarray) -> np.ndarray:
-    """d pole / d unknown = -phi' (s^2 dM + s dD + dK) phi / phi' (2 s M + D) phi, (poles, unknowns)."""
+def _pencil(fit: MatrixFit, s: complex) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Z = s^2 M + s D + K, its derivative to s, and to the unknowns, (N, N, p)."""
     M, D, K = (np.asarray(x) for x in fit.matrices)
     dM, dD, dK = (np.asarray(x) for x in fit.slopes)
+    return M * s**2 + D * s + K, 2 * s * M + D, dM * s**2 + dD * s + dK
+
+
+def _slopes_of_matrices(fit: MatrixFit, poles: np.ndarray) -> np.ndarray:
+    """d pole / d unknown = -phi' (s^2 dM + s dD + dK) phi / phi' (2 s M + D) phi, (poles, unknowns)."""
     rows = []
     for s in poles:
-        phi = np.linalg.svd(M * s**2 + D * s + K)[2][-1].conj()
-        change = np.einsum("i,ijp,j->p", phi, dM * s**2 + dD * s + dK, phi)
-        rows.append(-change / (phi @ (2 * s * M + D) @ phi))
+        Z, slope, change = _pencil(fit, s)
+        phi = np.linalg.svd(Z)[2][-1].conj()
+        rows.append(-np.einsum("i,ijp,j->p", phi, change, phi) / (phi @ slope @ phi))
     return np.stack(rows)
+
+
+def _slopes_of_shapes(
+    fit: MatrixFit, seen: np.ndarray, poles: np.ndarray, of_poles: np.ndarray
+) -> np.ndarray:
+    """d shape / d unknown at the sensors, the largest component held at 1, (outputs, poles, unknowns).
+
+    Z phi = 0 gives Z dphi = -(dZ + Z' ds) phi, which leaves only the size of phi open.
+    """
+    shapes = []
+    for s, ds in zip(poles, of_poles, strict=True):
+        Z, slope, change = _pencil(fit, s)
+        left, values, right = np.linalg.svd(Z)
+        phi = right[-1].conj()
+        push = np.einsum("ijp,j->ip", change, phi) + np.outer(slope @ phi, ds)
+        inner = (left.conj().T @ push)[:-1] / values[:-1, None]
+        moved, size = -seen @ (right[:-1].conj().T @ inner), seen @ phi
+        top = np.abs(size).argmax()
+        shapes.append((moved - np.outer(size / size[top], moved[top])) / size[top])
+    return np.stack(shapes, axis=1)
 
 
 def _slopes_of_denominators(space: StateSpace, poles: np.ndarray) -> np.ndarray:
@@ -140,5 +172,13 @@ def _deviations(
     size = np.maximum(np.abs(poles), np.finfo(float).tiny)
     frequency = np.real(slopes * poles.conj()[:, None]) / size[:, None]
     ratio = -np.real(slopes) / size[:, None] + (np.real(poles) / size**2)[:, None] * frequency
-    spread = lambda x: np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", x, covariance, x), 0.0))  # noqa: E731
-    return spread(frequency), spread(ratio)
+    return _spread(frequency, covariance), _spread(ratio, covariance)
+
+
+def _parts(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Standard deviation of the real part + 1j times that of the imaginary part."""
+    return _spread(np.real(slopes), covariance) + 1j * _spread(np.imag(slopes), covariance)
+
+
+def _spread(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.einsum("...p,pq,...q->...", slopes, covariance, slopes), 0.0))

@@ -16,7 +16,7 @@ class Mode(NamedTuple):
 
     Attributes:
         index: of the pole with positive imaginary part among the poles of the model.
-        pole: 1/s.
+        pole, pole_std: 1/s; the deviation of the real part + 1j times that of the imaginary part.
         frequency, frequency_std: Hz.
         damping_ratio, damping_ratio_std: relative to critical.
         indicators: mac, emac, mpc, cmi and msv; NaN where unknown.
@@ -25,6 +25,7 @@ class Mode(NamedTuple):
 
     index: int
     pole: complex
+    pole_std: complex
     frequency: float
     frequency_std: float
     damping_ratio: float
@@ -71,6 +72,7 @@ def modes_of(found: Identification) -> tuple[Mode, ...]:
         Mode(
             int(i),
             _clean(complex(poles[i])),
+            complex(found.pole_std[i]),
             float(numbers[0][i] / (2 * np.pi)),
             float(numbers[1][i] / (2 * np.pi)),
             float(numbers[2][i]),
@@ -123,16 +125,16 @@ def worst_fits(found: Identification, most: int = 20) -> list[int]:
 def connecting(found: Identification, which: str, between: tuple[str, str]) -> tuple[float, float]:
     """Stiffness or damping between two bodies, or a body and ground, as the matrix has it; its deviation.
 
-    -K_ij, and for the ground the sum of row i, whose deviation is not known.
+    -K_ij, and for the ground the sum of row i.
     """
-    values = np.asarray(getattr(found.matrices, which))
+    values, deviation = np.asarray(getattr(found.matrices, which)), found.matrices_std
     rows = [found.nominal.bodies.index(end) for end in between if end != GROUND]
     if len(rows) == 1:
         row = values[rows[0]]
         total = float(row.sum())
-        return total if abs(total) > 1e-9 * np.abs(row).sum() else 0.0, float("nan")
+        std = float("nan") if deviation is None else float(getattr(deviation, f"ground_{which}")[rows[0]])
+        return total if abs(total) > 1e-9 * np.abs(row).sum() else 0.0, std
     i, j = rows
-    deviation = found.matrices_std
     std = float("nan") if deviation is None else float(np.asarray(getattr(deviation, which))[i, j])
     return -float(values[i, j]), std
 

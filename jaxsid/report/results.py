@@ -7,7 +7,8 @@ import numpy as np
 from jaxsid.files.results_json import SCHEMA, plain
 from jaxsid.identification import Identification
 from jaxsid.records import SecondOrderModel
-from jaxsid.report.modes import Mode, modes_of
+from jaxsid.report.modes import displacement_shapes, modes_of
+from jaxsid.report.units import sensor_kinds
 
 MATRICES = ("mass", "damping", "stiffness")
 
@@ -23,7 +24,7 @@ def identification_json(found: Identification) -> dict[str, Any]:
         "name": found.nominal.name,
         "order": found.order,
         "order_reason": found.order_reason,
-        "modes": [_mode(mode) for mode in modes_of(found)],
+        "modes": _modes(found),
         "poles": np.asarray(found.modal.poles),
         **_matrices(found.matrices),
         "std": None if found.matrices_std is None else _matrices(found.matrices_std),
@@ -43,14 +44,25 @@ def identification_json(found: Identification) -> dict[str, Any]:
     return plain(data, "identification")
 
 
-def _mode(mode: Mode) -> dict[str, Any]:
-    return {
-        "frequency_hz": mode.frequency,
-        "damping_ratio": mode.damping_ratio,
-        "pole": mode.pole,
-        **mode.indicators,
-        "std": {"frequency_hz": mode.frequency_std, "damping_ratio": mode.damping_ratio_std},
-    }
+def _modes(found: Identification) -> list[dict[str, Any]]:
+    shapes = displacement_shapes(found, sensor_kinds(found.nominal, found.outputs))
+    spread = np.asarray(found.shape_std)
+    return [
+        {
+            "frequency_hz": mode.frequency,
+            "damping_ratio": mode.damping_ratio,
+            "pole": mode.pole,
+            "shape": dict(zip(found.outputs, shapes[:, mode.index], strict=True)),
+            **mode.indicators,
+            "std": {
+                "frequency_hz": mode.frequency_std,
+                "damping_ratio": mode.damping_ratio_std,
+                "pole": mode.pole_std,
+                "shape": dict(zip(found.outputs, spread[:, mode.index], strict=True)),
+            },
+        }
+        for mode in modes_of(found)
+    ]
 
 
 def _matrices(holder: Any) -> dict[str, Any]:
