@@ -15,6 +15,7 @@ SENSOR_KINDS = ("displacement", "velocity", "acceleration")
 
 
 Values = ArrayLike | Sequence[Any]  # an array, or lists of numbers
+Steps = tuple[int, ...] | range  # increasing from 0; a range costs nothing to look at, however long it is
 
 
 def warn_single_precision(x: Array) -> None:
@@ -166,8 +167,8 @@ class Realization(eqx.Module):
     observability: Float[Array, "rows n"] | None
     controllability: Float[Array, "n cols"] | None
     pole: Float[Array, ""]
-    row_steps: tuple[int, ...] = eqx.field(static=True)
-    column_steps: tuple[int, ...] = eqx.field(static=True)
+    row_steps: Steps = eqx.field(static=True)
+    column_steps: Steps = eqx.field(static=True)
     hold: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -182,8 +183,8 @@ class Realization(eqx.Module):
         observability: Values | None = None,
         controllability: Values | None = None,
         pole: Values = 0.0,
-        row_steps: Sequence[int] = (),
-        column_steps: Sequence[int] = (),
+        row_steps: Steps = (),
+        column_steps: Steps = (),
         hold: str | Sequence[str] = "zero",
     ):
         self.A, self.B, self.C, self.D = (floating(x) for x in (A, B, C, D))
@@ -192,7 +193,7 @@ class Realization(eqx.Module):
         self.observability = None if observability is None else floating(observability)
         self.controllability = None if controllability is None else floating(controllability)
         self.pole = jnp.asarray(pole, dtype=self.A.dtype)
-        self.row_steps, self.column_steps = tuple(row_steps), tuple(column_steps)
+        self.row_steps, self.column_steps = row_steps, column_steps
         self.hold = holds(hold, self.B.shape[-1])
 
 

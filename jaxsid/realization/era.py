@@ -1,5 +1,7 @@
 """The eigensystem realization algorithm (ERA)."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -15,7 +17,7 @@ from jaxsid.realization.subspace import (
     leading_values,
     small_enough,
 )
-from jaxsid.realization.window import check_method, check_order, check_response, check_steps, era_window
+from jaxsid.realization.window import check_method, check_order, check_response, era_window
 from jaxsid.records import ImpulseResponse, Realization
 
 LARGEST_CANDIDATE = 40  # orders that are weighed when none is given
@@ -28,8 +30,8 @@ def era(
     rows: int | None = None,
     cols: int | None = None,
     stride: int = 1,
-    row_steps: tuple[int, ...] | None = None,
-    column_steps: tuple[int, ...] | None = None,
+    row_steps: Sequence[int] | None = None,
+    column_steps: Sequence[int] | None = None,
     method: str = "fast",
 ) -> Realization:
     """A balanced discrete-time model of chosen order from Markov parameters.
@@ -63,15 +65,15 @@ def era(
     """
     check_response(ir)
     check_method(method)
-    row_steps, column_steps = era_window(ir.h.shape[0], rows, cols, stride, row_steps, column_steps)
-    check_steps(row_steps, column_steps, ir.h.shape[0])
-    shape = (len(row_steps) * ir.h.shape[1], len(column_steps) * ir.h.shape[2])
+    given = (None if x is None else tuple(int(i) for i in x) for x in (row_steps, column_steps))
+    window = era_window(ir.h.shape[0], rows, cols, stride, *given)
+    shape = window.shape(*ir.h.shape[1:])
     if order is None:
         candidates = min(LARGEST_CANDIDATE, *shape)
-        values = _singular_values(ir.h, row_steps, column_steps, candidates)
+        values = _singular_values(ir.h, window, candidates)
         order = select_order(values, shape=shape).order
     check_order(order, shape)
-    A, B, C, D, factors = _era(ir.h, ir.pole, row_steps, column_steps, order, method == "svd")
+    A, B, C, D, factors = _era(ir.h, ir.pole, window, order, method == "svd")
     return Realization(
         A,
         B,
@@ -80,8 +82,8 @@ def era(
         ir.dt,
         **factors,
         pole=ir.pole,
-        row_steps=row_steps,
-        column_steps=column_steps,
+        row_steps=window.rows,
+        column_steps=window.columns,
         hold=ir.hold,
     )
 
@@ -118,9 +120,9 @@ def named_factors(space: Subspace, observability: Array, controllability: Array)
 
 
 @compiled
-def _era(h, pole, row_steps, column_steps, order, full):
-    change = hankel_operator(jnp.diff(h, axis=0), row_steps, column_steps, 1)
-    operator = hankel_operator(h, row_steps, column_steps, 1, full)
+def _era(h, pole, window, order, full):
+    change = hankel_operator(jnp.diff(h, axis=0), window.rows, window.columns, 1)
+    operator = hankel_operator(h, window.rows, window.columns, 1, full)
     space = factor(operator, order, full)
     a, observability, controllability = balanced(operator, change, space)
     b, c = controllability[:, : h.shape[2]], observability[: h.shape[1]]
@@ -128,6 +130,6 @@ def _era(h, pole, row_steps, column_steps, order, full):
 
 
 @compiled
-def _singular_values(h, row_steps, column_steps, candidates):
-    operator = hankel_operator(h, row_steps, column_steps, 1)
+def _singular_values(h, window, candidates):
+    operator = hankel_operator(h, window.rows, window.columns, 1)
     return leading_values(operator, candidates)

@@ -12,6 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
+from jaxsid.records import Steps
+
 # Cost of one element of a dense product against one butterfly of a Fourier transform, measured on CPU.
 BUTTERFLY_COST = 4.0
 LARGEST_DENSE = 2**24  # elements; above it the matrix is never formed by the fast method
@@ -69,8 +71,8 @@ Operator = DenseOperator | FourierOperator
 def _correlate(
     spectrum: Complex[Array, "frequencies p q"],
     v: Float[Array, "given k"],
-    given: tuple[int, ...],
-    wanted: tuple[int, ...],
+    given: Steps,
+    wanted: Steps,
     length: int,
 ) -> Float[Array, "wanted k"]:
     """sum_j g[i + j]' v_j at the wanted i, from v_j at the given j, with g of shape (p, q)."""
@@ -83,11 +85,11 @@ def _correlate(
     return jnp.swapaxes(series, 1, 2).reshape(v.shape[1], -1).T
 
 
-def _contiguous(steps: tuple[int, ...]) -> bool:
+def _contiguous(steps: Steps) -> bool:
     return steps[-1] == len(steps) - 1
 
 
-def _spread(blocks: Float[Array, "k given p"], steps: tuple[int, ...]) -> Float[Array, "k time p"]:
+def _spread(blocks: Float[Array, "k given p"], steps: Steps) -> Float[Array, "k time p"]:
     """Blocks put at their instants, zeros between."""
     if _contiguous(steps):
         return blocks
@@ -107,15 +109,15 @@ def fast_length(n: int) -> int:
         n += 1
 
 
-def last_sample(row_steps: tuple[int, ...], column_steps: tuple[int, ...], first: int) -> int:
+def last_sample(row_steps: Steps, column_steps: Steps, first: int) -> int:
     """Index of the last sample that a block Hankel matrix from `first` on reads."""
     return first + row_steps[-1] + column_steps[-1]
 
 
 def hankel_matrix(
     g: Float[Array, "samples outputs inputs"],
-    row_steps: tuple[int, ...],
-    column_steps: tuple[int, ...],
+    row_steps: Steps,
+    column_steps: Steps,
     first: int = 0,
 ) -> Float[Array, "rows cols"]:
     """The dense block Hankel matrix with blocks g[first + s_i + t_j]. Source: thesis [4.14]."""
@@ -128,8 +130,8 @@ def hankel_matrix(
 
 def hankel_operator(
     g: Float[Array, "samples outputs inputs"],
-    row_steps: tuple[int, ...],
-    column_steps: tuple[int, ...],
+    row_steps: Steps,
+    column_steps: Steps,
     first: int = 0,
     dense: bool = False,
 ) -> Operator:

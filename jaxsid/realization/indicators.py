@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
-from jaxsid.records import Indicators, Realization
+from jaxsid.records import Indicators, Realization, Steps
 
 FADED = 0.05  # part of its first amplitude below which a mode has nothing left to compare
 
@@ -75,7 +75,7 @@ def _ratio(numerator: Array, denominator: Array) -> Array:
     return jnp.where(empty, 0, numerator / jnp.where(empty, 1, denominator))
 
 
-def _powers(lam: Complex[Array, " n"], steps: tuple[int, ...]) -> Complex[Array, "n steps"]:
+def _powers(lam: Complex[Array, " n"], steps: Steps) -> Complex[Array, "n steps"]:
     """lambda^step; a zero eigenvalue has only its zeroth power."""
     steps_array = np.asarray(steps) - steps[0]
     safe = jnp.where(lam == 0, 1, lam)
@@ -84,7 +84,7 @@ def _powers(lam: Complex[Array, " n"], steps: tuple[int, ...]) -> Complex[Array,
 
 
 def _coherence(
-    blocks: Complex[Array, "n count channels"], lam: Complex[Array, " n"], steps: tuple[int, ...]
+    blocks: Complex[Array, "n count channels"], lam: Complex[Array, " n"], steps: Steps
 ) -> Float[Array, " n"]:
     """Modal amplitude coherence between the blocks and the geometric sequence of the first one."""
     expected = blocks[:, :1] * _powers(lam, steps)[:, :, None]
@@ -93,7 +93,7 @@ def _coherence(
 
 
 def _consistency(
-    blocks: Complex[Array, "n count channels"], lam: Complex[Array, " n"], steps: tuple[int, ...]
+    blocks: Complex[Array, "n count channels"], lam: Complex[Array, " n"], steps: Steps
 ) -> Float[Array, " n"]:
     """One half of EMAC: a late block against the first one carried there, in amplitude and phase."""
     first, powers = blocks[:, 0], _powers(lam, steps)

@@ -13,7 +13,7 @@ from jaxsid.mechanics.hold import check_holds
 from jaxsid.realization.era import balanced, factor
 from jaxsid.realization.hankel import hankel_operator
 from jaxsid.realization.indicators import phase_collinearity
-from jaxsid.realization.window import check_method, check_order, check_response, check_steps, era_window
+from jaxsid.realization.window import check_method, check_order, check_response, era_window
 from jaxsid.records import ImpulseResponse, as_array
 
 
@@ -84,12 +84,11 @@ def stabilization(
     check_holds(ir.hold, ir.h.shape[2])
     require(is_concrete(ir.h), "a stabilization diagram is eager: it cannot be traced")
     require(len(orders) > 0 and list(orders) == sorted(set(orders)), f"orders must increase, not {orders}")
-    row_steps, column_steps = era_window(ir.h.shape[0], rows, cols, stride, None, None)
-    check_steps(row_steps, column_steps, ir.h.shape[0])
-    shape = (len(row_steps) * ir.h.shape[1], len(column_steps) * ir.h.shape[2])
+    window = era_window(ir.h.shape[0], rows, cols, stride, None, None)
+    shape = window.shape(*ir.h.shape[1:])
     check_order(orders[-1], shape)
     check_order(orders[0], shape)
-    a, c, values = _largest(ir.h, ir.pole, row_steps, column_steps, orders[-1], method == "svd")
+    a, c, values = _largest(ir.h, ir.pole, window, orders[-1], method == "svd")
     numbers = np.asarray(a), np.asarray(c), float(ir.pole), float(ir.dt), ir.hold[0]
     models = [_modes(*numbers, n) for n in orders]
     tolerances = (frequency_tolerance, damping_tolerance, shape_tolerance)
@@ -97,10 +96,10 @@ def stabilization(
 
 
 @compiled
-def _largest(h, pole, row_steps, column_steps, order, full) -> tuple[Array, Array, Array]:
+def _largest(h, pole, window, order, full) -> tuple[Array, Array, Array]:
     """Balanced A and C of the largest order, in the shift of h; those of a smaller one are their corners."""
-    operator = hankel_operator(h, row_steps, column_steps, 1, full)
-    change = hankel_operator(jnp.diff(h, axis=0), row_steps, column_steps, 1)
+    operator = hankel_operator(h, window.rows, window.columns, 1, full)
+    change = hankel_operator(jnp.diff(h, axis=0), window.rows, window.columns, 1)
     space = factor(operator, order, full)
     a, observability, _ = balanced(operator, change, space)
     return a, observability[: h.shape[1]], space.values

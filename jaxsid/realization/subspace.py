@@ -27,7 +27,7 @@ LARGEST_SIDE = 512  # shorter side of a matrix that is decomposed in full after 
 OVERSAMPLING = 5
 # Residual at which iteration stops: that of LAPACK, in units of eps times the largest singular value, or one that is
 # as good as none beside the noise, in units of the first discarded singular value.
-RESIDUAL, UNSEEN = 30.0, 1e-8
+RESIDUAL, UNSEEN = 30.0, 1e-9
 CG_STEPS = 300
 ROUGH_RESTARTS = 2
 BLOCK_ELEMENTS = 4096  # of a block of rows in a QR factorization

@@ -20,7 +20,7 @@ from jaxsid.checks import require
 from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import laguerre_to_shift, shift_to_laguerre
 from jaxsid.realization.hankel import fast_length
-from jaxsid.records import ImpulseResponse, Realization
+from jaxsid.records import ImpulseResponse, Realization, Steps
 from jaxsid.uncertainty.noise import ResponseNoise
 
 
@@ -144,7 +144,7 @@ def _response_rows(
     return total.at[:, 0].add(to_d)
 
 
-def _in_time(blocks: Array, steps: tuple[int, ...], length: int) -> Array:
+def _in_time(blocks: Array, steps: Steps, length: int) -> Array:
     """Blocks put at their time indices, zero between."""
     return jnp.zeros((length, *blocks.shape[1:]), blocks.dtype).at[jnp.array(steps)].set(blocks)
 
