@@ -87,7 +87,7 @@ class Experiment(eqx.Module):
         if self.excitation is None:
             return ImpulseResponse(y, self.dt)
         if self.observer is not None:
-            return self.observer(y, self.plan.samples)
+            return self.observer(y, self.dt, self.plan.samples)
         records = one_after_another(self.excitation, y, self.dt)
         return METHODS[self.plan.method](records, self.plan.samples)
 
@@ -135,12 +135,7 @@ def make_experiment(case: Case) -> Experiment:
     exact = driven(np.asarray(impulse_response_of(system.model, dt, samples=length).h), u)
     size = np.sqrt(np.mean(exact**2, axis=(0, 2)))
     least = cramer_rao(system, structure, Sampling(dt, length, u, size, plan.colour))
-    inband = plan.method == "inband"
-    observer = (
-        prepare_observer(one_after_another(jnp.asarray(u), jnp.asarray(exact), jnp.asarray(dt)))
-        if inband
-        else None
-    )
+    observer = prepare_observer(u, exact) if u is not None and plan.method == "inband" else None
     return Experiment(
         names,
         units,

@@ -56,10 +56,10 @@ def one_after_another(u: Array, y: Float[Array, "samples outputs inputs"], dt: A
 
 
 class Observer(eqx.Module):
-    """The in-band observer with all that does not depend on the outputs prepared.
+    """The in-band observer with all that does not depend on the outputs prepared, in units of samples.
 
     Attributes:
-        lines: of the inputs; its outputs are those without noise.
+        lines: of the inputs at a sampling interval of 1; its outputs are those without noise.
         line, record: number of each line in its record, and of its record.
         pole: of the Laguerre shift.
         largest: order tried.
@@ -71,11 +71,12 @@ class Observer(eqx.Module):
     pole: Float[Array, ""]
     largest: int = eqx.field(static=True)
 
-    def __call__(self, y: Float[Array, "samples outputs inputs"], samples: int) -> ImpulseResponse:
+    def __call__(self, y: Float[Array, "samples outputs inputs"], dt: Array, samples: int) -> ImpulseResponse:
         """Markov parameters in the Laguerre shift.
 
         Args:
             y: outputs of the records.
+            dt: sampling interval, s.
             samples: number of Markov parameters.
         """
         spectrum = jnp.fft.rfft(y, axis=0) / np.sqrt(len(y))
@@ -83,22 +84,24 @@ class Observer(eqx.Module):
             lambda x: x.y, self.lines, spectrum[self.line, :, self.record] * self.lines.weight
         )
         h, _, _ = observer(lines, jnp.arange(y.shape[1]), self.pole, self.largest, samples)
-        return ImpulseResponse(h, lines.dt, pole=self.pole, hold=lines.hold, method="in-band observer")
+        return ImpulseResponse(h, dt, pole=self.pole, hold=lines.hold, method="in-band observer")
 
 
-def prepare_observer(records: list[Record]) -> Observer:
+def prepare_observer(
+    u: Float[np.ndarray, " samples"], y: Float[np.ndarray, "samples outputs inputs"]
+) -> Observer:
     """The observer for records like these, whose inputs tell the band.
 
     Args:
-        records: of equal length, with values.
+        u: excitation of each input in turn.
+        y: outputs without noise.
 
     Raises:
         InsufficientDataError: too few lines in the band.
     """
-    lines = record_lines(records)
+    lines = record_lines(one_after_another(jnp.asarray(u), jnp.asarray(y), jnp.ones(())))
     outputs = np.arange(lines.y.shape[1])
-    length = len(records[0].u)
-    line = np.round(np.asarray(lines.omega) * float(lines.dt) * length / (2 * np.pi)).astype(int)
+    line = np.round(np.asarray(lines.omega) * len(u) / (2 * np.pi)).astype(int)
     owner = np.argmax(np.asarray(lines.record), axis=1)
     # what names the records is static and would tell apart programs that are the same
     plain = replace(lines, record_dt=(), samples=())
