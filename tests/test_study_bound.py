@@ -144,6 +144,35 @@ def test_modes_against_all_unknowns_at_once(inputs, excited):
     assert np.isfinite(got).sum() == 2 * len(excited)
 
 
+def test_explicit_covariance_of_a_free_shaft():
+    """The rig: its stiffness is one number, since no spring holds the free rotation."""
+    system, samples, dt = make_system("rig", "default", "default"), 120, 1e-3
+    upper, B = np.triu_indices(2), np.array([[1.0], [0.0]])
+    scale = np.array([0.005, 0.005, 0.18, 1, 1, 1, 9365.0])
+
+    def full(x):
+        mass, damping = np.zeros((2, 2)), np.zeros((2, 2))
+        mass[upper], damping[upper] = (x * scale)[:3], (x * scale)[3:6]
+        stiffness = x[6] * scale[6] * np.array([[1, -1], [-1, 1]])
+        return mass + np.triu(mass, 1).T, damping + np.triu(damping, 1).T, stiffness
+
+    def record(x):
+        return (response(*full(x), B, "velocity", dt, samples)[0] / [[1.0], [0.1]]).ravel()
+
+    def quantities(x):
+        poles = response(*full(x), B, "velocity", dt, 2)[1]
+        still = poles[np.abs(np.imag(poles)) < 1e-6]
+        return np.concatenate([judged(poles), [np.real(still).min()], *(y[upper] for y in full(x))])
+
+    so = system.mechanics.matrices
+    x = np.concatenate([np.asarray(so.mass)[upper], np.asarray(so.damping)[upper], [9365.0]]) / scale
+    J, G = differences(record, x), differences(quantities, x)
+    expected = np.sqrt(np.diag(G @ np.linalg.solve(J.T @ J, G.T)))
+    sampling = Sampling(dt, samples, None, np.array([1.0, 0.1]), "white")
+    got = cramer_rao(system, structure_of(system, 3), sampling)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
 def test_modes_and_matrices_agree_where_the_unknowns_are_the_same():
     """One body: M, D, K are as many numbers as a pole pair and its shape of one output, but for the zero phase."""
     system = make_system("one_dof", "displacement", "default")

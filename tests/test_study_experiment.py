@@ -265,6 +265,7 @@ def test_a_system_from_its_modes_keeps_its_channels():
     assert (system.order, whole.order) == (30, 30)
 
 
+@pytest.mark.slow
 def test_vmap_is_the_calls():
     experiment = make("chain2")
     keys = jax.random.split(KEY, 3)
