@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from jaxsid.records import Record as Record
     from jaxsid.records import SecondOrderModel as SecondOrderModel
     from jaxsid.uncertainty.ensemble import ensemble as ensemble
+    from jaxsid.uncertainty.monte_carlo import monte_carlo as monte_carlo
     from jaxsid.uncertainty.noise import CorrelatedNoise as CorrelatedNoise
     from jaxsid.uncertainty.noise import IndependentNoise as IndependentNoise
     from jaxsid.uncertainty.noise import StationaryNoise as StationaryNoise
@@ -103,6 +104,7 @@ _HOMES = {
         "SecondOrderModel",
     ),
     "jaxsid.uncertainty.ensemble": ("ensemble",),
+    "jaxsid.uncertainty.monte_carlo": ("monte_carlo",),
     "jaxsid.uncertainty.noise": ("CorrelatedNoise", "IndependentNoise", "StationaryNoise"),
     "jaxsid.uncertainty.propagate": ("propagate", "propagate_response"),
 }
