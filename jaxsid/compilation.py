@@ -52,6 +52,7 @@ class _Place:
 
 
 _kept: _Folder | None = None
+_in_memory: list[dict[bytes, _Program]] = []  # of each compiled function
 
 
 def keep_programs(folder: str | Path | None) -> None:
@@ -81,10 +82,29 @@ def default_folder() -> Path:
     return Path(os.environ.get("JAXSID_CACHE") or home / "jaxsid")
 
 
+def release_programs(most_maps: int = 20_000) -> None:
+    """Drop the programs that are in memory once they take many memory maps.
+
+    A program takes hundreds, and Linux ends a process that asks for more than 65530. Elsewhere nothing happens.
+
+    Args:
+        most_maps: that may stay.
+    """
+    try:
+        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return
+    if maps > most_maps:
+        for programs in _in_memory:
+            programs.clear()
+        jax.clear_caches()
+
+
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """As `equinox.filter_jit`: arrays are traced, all else is static; kept on disk after `keep_programs`."""
     jitted = eqx.filter_jit(function)
     programs: dict[bytes, _Program] = {}
+    _in_memory.append(programs)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:

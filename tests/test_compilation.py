@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsid.compilation
-from jaxsid.compilation import compiled, keep_programs
+from jaxsid.compilation import compiled, keep_programs, release_programs
 from jaxsid.examples.systems import three_dof
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import second_order
@@ -137,6 +137,24 @@ def test_the_programs_unused_for_longest_go(
         run(matrix[:n, :n], jnp.asarray(1.0))
     assert len(list(folder.iterdir())) == 2
     assert not first.exists()
+
+
+def test_released_programs_come_back_from_disk(folder: Path, matrix: np.ndarray):
+    traces = Traces()
+    run = traces.fresh()
+    first = run(matrix, jnp.asarray(1.0))[0].values
+    release_programs(10**9)
+    run(matrix, jnp.asarray(1.0))
+    maps = memory_maps()
+    release_programs(0)
+    assert memory_maps() < maps
+    count = traces.count
+    np.testing.assert_array_equal(run(matrix, jnp.asarray(1.0))[0].values, first)
+    assert traces.count == count
+
+
+def memory_maps() -> int:
+    return Path("/proc/self/maps").read_text().count("\n")
 
 
 def test_a_callable_argument_is_compiled_but_not_kept(folder: Path):

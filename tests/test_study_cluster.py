@@ -13,7 +13,7 @@ from study_helpers import Guess, environment, make, results, run, study
 
 from jaxsid.checks import InputError
 from jaxsid.study import cluster
-from jaxsid.study.cluster import LostSchedulerError, local_workers, remote_workers
+from jaxsid.study.cluster import LostClusterError, local_workers, remote_workers
 from jaxsid.study.engine import run_study
 from jaxsid.study.store import open_store
 
@@ -115,7 +115,7 @@ def test_other_versions_on_a_worker_are_told(tmp_path, machines, monkeypatch):
 
 def test_the_scheduler_is_killed(tmp_path, machines, expected):
     with (
-        pytest.raises(LostSchedulerError, match="What was done is kept"),
+        pytest.raises(LostClusterError, match="What was done is kept"),
         remote_workers(machines.address, timeout=2.0) as execute,
     ):
         run(PLAN, tmp_path, execute=execute, progress=at(160, machines.scheduler.kill))

@@ -7,17 +7,24 @@ lost the study stops, and goes on when it is begun again.
 
 import functools
 import logging
+import math
+import os
 import pickle
+import queue
 import signal
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
+# Before JAX loads, on workers: it logs a needless warning for each program that it reads back.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import dask.config
 import jax
 import numpy as np
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster
 from distributed.client import Future, FutureCancelledError
 from jaxtyping import Float
 
@@ -29,11 +36,13 @@ from jaxsid.study.store import versions
 AHEAD = 3  # jobs given out for each thread of a worker, so that none waits for the next
 FEWEST = 8  # threads that jobs are given out for, even while fewer are there
 LIVES = 3  # times that a job is given out anew after dask gave it up, since worker after worker died over it
+LOOK = 5.0  # seconds after which a look at the workers is taken
+PATIENCE = 60.0  # seconds that workers of this machine have to come back
 FAILURES = 10  # workers that may die over a job before dask gives it up
 
 
-class LostSchedulerError(JaxsidError):
-    """The scheduler went away while a study ran."""
+class LostClusterError(JaxsidError):
+    """The scheduler or all workers went away while a study ran."""
 
 
 class Parcel(NamedTuple):
@@ -84,7 +93,7 @@ def local_workers(count: int) -> Iterator[Execute]:
             silence_logs=logging.CRITICAL,
         )
     with cluster, Client(cluster) as client:
-        yield functools.partial(on_cluster, client)
+        yield functools.partial(on_cluster, client, patience=PATIENCE)
 
 
 @contextmanager
@@ -122,27 +131,33 @@ def remote_workers(address: str, timeout: float = 30.0) -> Iterator[Execute]:
         yield functools.partial(on_cluster, client)
 
 
-def on_cluster(client: Client, jobs: Iterable[Job]) -> Iterator[Done]:
+def on_cluster(client: Client, jobs: Iterable[Job], *, patience: float = math.inf) -> Iterator[Done]:
     """Give out a few jobs for each worker, and a new one for each result.
 
+    Args:
+        client: of the scheduler.
+        jobs: to do.
+        patience: seconds to wait while there is no worker at all.
+
     Raises:
-        LostSchedulerError: the scheduler went away.
+        LostClusterError: the scheduler or all workers went away.
         InputError: a worker has no jaxsid, or other versions; a job killed worker after worker.
     """
-    results, out = as_completed(loop=client.loop), _Out(client, iter(jobs))
+    out = _Out(client, iter(jobs))
     try:
-        results.update(out.more())
-        for future in results:
+        out.fill()
+        while out.given:
+            future = out.next(patience)
             job, lives = out.given.pop(future)
             try:
                 values = future.result()
             except KilledWorker as error:
-                results.add(out.again(job, lives, error))
+                out.again(job, lives, error)
                 continue
             yield Done(job, values)
-            results.update(out.more())
+            out.fill()
     except (FutureCancelledError, OSError) as error:
-        raise LostSchedulerError(
+        raise LostClusterError(
             "the dask scheduler was lost. What was done is kept; start a scheduler and run the same command again."
         ) from error
     except (ImportError, RuntimeError) as error:
@@ -160,37 +175,50 @@ class _Out:
     def __init__(self, client: Client, jobs: Iterator[Job]):
         self.client, self.jobs = client, jobs
         self.given: dict[Future, tuple[Job, int]] = {}
+        self.finished: queue.Queue[Future] = queue.Queue()
         self.packed: tuple[Estimator | None, bytes] = (None, b"")
 
-    def more(self) -> list[Future]:
-        """New jobs, as many as the workers that are there now want."""
+    def fill(self) -> None:
+        """Give out new jobs, as many as the workers that are there now want."""
         most = AHEAD * max(self._threads(), FEWEST)
-        new = []
         while len(self.given) < most and (job := next(self.jobs, None)) is not None:
-            new.append(self.submit(job, LIVES))
-        return new
+            self.submit(job, LIVES)
 
-    def _threads(self) -> int:
-        there = self.client.nthreads()
-        assert isinstance(there, dict)  # a coroutine for asynchronous clients only
-        return sum(there.values())
+    def next(self, patience: float) -> Future:
+        """The next one that is finished, well or not."""
+        alone_since = None
+        while True:
+            try:
+                return self.finished.get(timeout=LOOK)
+            except queue.Empty:
+                now = time.monotonic()
+                alone_since = None if self._threads() else alone_since or now
+            if alone_since is not None and now - alone_since > patience:
+                raise LostClusterError(
+                    "all workers ended and none came back. What was done is kept; run the same command again."
+                )
 
-    def submit(self, job: Job, lives: int) -> Future:
+    def submit(self, job: Job, lives: int) -> None:
         if self.packed[0] is not job.experiment:
             self.packed = (job.experiment, pickle.dumps(job.experiment))
         what = Parcel(*job[:4], self.packed[1], bool(jax.config.read("jax_enable_x64")), versions())
         future = self.client.submit(pickle.loads, what.called(), pure=False, priority=LIVES - lives)
         self.given[future] = (job, lives)
-        return future
+        future.add_done_callback(self.finished.put)
 
-    def again(self, job: Job, lives: int, error: KilledWorker) -> Future:
-        """The job once more after dask gave it up."""
-        if lives > 0:
-            return self.submit(job, lives - 1)
-        raise InputError(
-            f"realizations {job.first} to {job.first + job.count - 1} of case {job.case} killed worker after worker: "
-            "most likely for want of memory. Give each worker more, or write a smaller chunk in the study."
-        ) from error
+    def again(self, job: Job, lives: int, error: KilledWorker) -> None:
+        """Give the job out once more after dask gave it up."""
+        if lives == 0:
+            raise InputError(
+                f"realizations {job.first} to {job.first + job.count - 1} of case {job.case} killed worker after "
+                "worker: most likely for want of memory. Give each worker more, or write a smaller chunk in the study."
+            ) from error
+        self.submit(job, lives - 1)
+
+    def _threads(self) -> int:
+        there = self.client.nthreads()
+        assert isinstance(there, dict)  # a coroutine for asynchronous clients only
+        return sum(there.values())
 
 
 def work(parcel: Parcel) -> Float[np.ndarray, "count quantities"]:

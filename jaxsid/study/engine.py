@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import InputError, JaxsidError
+from jaxsid.compilation import release_programs
 from jaxsid.study.configuration import Case, Study
 from jaxsid.study.experiment import make_experiment
 from jaxsid.study.parts import missing, sound_parts, write_part
@@ -93,6 +94,7 @@ def realizations(job: Job, threads: int | None = None) -> Float[np.ndarray, "cou
         job: what to do.
         threads: as for `ensemble`.
     """
+    release_programs()
     key = jax.random.fold_in(jax.random.key(job.seed), job.case)
     return ensemble(job.experiment, key, job.count, first=job.first, chunk=BATCH, threads=threads)
 
@@ -137,6 +139,7 @@ def run_study(
 
 def _made(case: Case, make: Callable[[Case], Estimator]) -> Estimator:
     """The experiment; an error says which case it was."""
+    release_programs()
     try:
         return make(case)
     except JaxsidError as error:

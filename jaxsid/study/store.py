@@ -9,6 +9,8 @@ What is missing follows from the parts that are there; nothing else remembers pr
 """
 
 import fcntl
+import functools
+import hashlib
 import json
 import os
 import socket
@@ -26,7 +28,18 @@ from jaxsid.study.configuration import Study
 from jaxsid.study.parts import put
 
 SCHEMA = 1
-BUILT_WITH = ("jaxsid", "jax")  # other versions give other last digits, so that results would be a mixture
+DECIDING = (
+    "records",
+    "modes",
+    "least_squares",
+    "mechanics",
+    "examples",
+    "impulse",
+    "realization",
+    "physical",
+    "uncertainty",
+    "study",
+)
 SHOWN = 5  # differences named in a message
 ABSENT = "absent"
 
@@ -40,9 +53,14 @@ class Facts(NamedTuple):
     bound: Float[np.ndarray, " q"]
 
 
+@functools.cache
 def versions() -> dict[str, str]:
-    """What the results depend on besides the study."""
-    return {name: version(name) for name in BUILT_WITH}
+    """What the results depend on besides the study: versions, and the sources of what computes the numbers."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for part in DECIDING:
+        for source in sorted((package / part).rglob("*.py")) or [package / f"{part}.py"]:
+            digest.update(source.read_bytes())
+    return {"jaxsid": f"{version('jaxsid')} ({digest.hexdigest()[:8]})", "jax": version("jax")}
 
 
 @contextmanager
