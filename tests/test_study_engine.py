@@ -100,6 +100,7 @@ def wait_for(condition, process, seconds=60):
         time.sleep(0.002)
 
 
+@pytest.mark.slow
 def test_kill_9_loses_and_repeats_nothing(tmp_path, undisturbed):
     """A process is killed while it starts, after the first parts, in the middle, and while it writes the tables."""
     moments = (
