@@ -29,6 +29,7 @@ class _State(NamedTuple):
     cost: Array
     product: Array
     gradient: Array
+    candidate: Array
     damping: Array
     steps: Array
     finished: Array
@@ -69,26 +70,30 @@ def levenberg_marquardt(
         r, j = evaluate(value)
         return 0.5 * r @ r, j.T @ j, j.T @ r
 
-    def advance(state: _State) -> _State:
-        scale = jnp.sqrt(jnp.maximum(jnp.diag(state.product), jnp.finfo(start.dtype).tiny))
-        normal = state.product / scale / scale[:, None] + state.damping * jnp.eye(len(start))
-        step = -jnp.linalg.solve(normal, state.gradient / scale) / scale
-        value = state.value + step
-        cost, product, gradient = products(value)
-        better = cost < state.cost
-        gained = (state.cost - cost) / jnp.maximum(state.cost, jnp.finfo(start.dtype).tiny)
-        finished = jnp.where(better, gained < tolerance, state.damping > 1e8)
-        keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
-        return _State(
-            keep(value, state.value),
-            keep(cost, state.cost),
-            keep(product, state.product),
-            keep(gradient, state.gradient),
-            jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), state.damping * 10),
-            state.steps + 1,
-            finished,
-        )
+    def step(product: Array, gradient: Array, damping: Array) -> Array:
+        scale = jnp.sqrt(jnp.maximum(jnp.diag(product), jnp.finfo(start.dtype).tiny))
+        normal = product / scale / scale[:, None] + damping * jnp.eye(len(start))
+        return -jnp.linalg.solve(normal, gradient / scale) / scale
 
-    first = _State(start, *products(start), jnp.asarray(1e-3, start.dtype), jnp.array(1), jnp.array(False))
-    last = jax.lax.while_loop(lambda s: ~s.finished & (s.steps < max_steps), advance, first)
+    # the start is the first candidate, so that the evaluation is compiled once
+    def advance(state: _State) -> _State:
+        found = products(state.candidate)
+        better, first = found[0] < state.cost, state.steps == 0
+        gained = (state.cost - found[0]) / jnp.maximum(state.cost, jnp.finfo(start.dtype).tiny)
+        finished = jnp.where(better, gained < tolerance, state.damping > 1e8) & ~first
+        keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
+        value, (cost, product, gradient) = (
+            keep(state.candidate, state.value),
+            map(keep, found, (state.cost, state.product, state.gradient)),
+        )
+        changed = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), state.damping * 10)
+        damping = jnp.where(first, state.damping, changed)
+        candidate = value + step(product, gradient, damping)
+        return _State(value, cost, product, gradient, candidate, damping, state.steps + 1, finished)
+
+    most = jnp.asarray(jnp.inf, start.dtype)
+    nothing = jnp.eye(len(start), dtype=start.dtype), jnp.zeros_like(start)
+    damping = jnp.asarray(1e-3, start.dtype)
+    state = _State(start, most, *nothing, start, damping, jnp.array(0), jnp.array(False))
+    last = jax.lax.while_loop(lambda s: ~s.finished & (s.steps < max_steps), advance, state)
     return Minimum(last.value, last.cost, last.product, last.steps)

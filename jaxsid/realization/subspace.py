@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 from jaxsid.realization.hankel import LARGEST_DENSE, DenseOperator
 from jaxsid.realization.lapack import qr, svd
 
-# A narrow block ends most searches at a small price. The few that it does not are left to the full decomposition,
-# or, where the matrix is large, go on with a block twice as wide.
-FEW_RESTARTS, NARROW_RESTARTS, RESTARTS = 2, 5, 60
+# Most searches end after one or two restarts; where a full decomposition is not dear it then takes over.
+FEW_RESTARTS, RESTARTS = 2, 120
 LARGEST_SIDE = 512  # shorter side of a matrix that is decomposed in full after all
 OVERSAMPLING = 5
 # Residual at which iteration stops: that of LAPACK, in units of eps times the largest singular value, or one that is
@@ -211,36 +210,14 @@ def _expand(operator: LinearOperator, state: _State, width: int) -> _State:
     return _State(left, values, right, operator.mv(right), state.count + 1)
 
 
-def _widen(operator: LinearOperator, state: _State, width: int) -> _State:
-    """The state with more vectors; the new ones are random until the next restart."""
-    rows, cols = operator.shape
-    more = width - state.left.shape[1]
-    dtype = state.image.dtype
-    blank = jnp.zeros((rows, more), dtype), jnp.zeros((cols, more), dtype)
-    random = jax.random.uniform(jax.random.key(1), (rows, more), dtype, -1.0, 1.0)
-    values = jnp.concatenate(
-        [state.values, jnp.zeros(_values_kept(operator, width) - len(state.values), dtype)]
-    )
-    return _State(
-        jnp.concatenate([state.left, blank[0]], axis=1),
-        values,
-        jnp.concatenate([state.right, blank[1]], axis=1),
-        jnp.concatenate([state.image, random * state.values[-1] / rows**0.5], axis=1),
-        state.count,
-    )
-
-
 def _iterate(operator: LinearOperator, order: int) -> Subspace:
-    narrow, wide = (min(k * (order + OVERSAMPLING), *operator.shape) for k in (1, 2))
+    width = min(order + OVERSAMPLING, *operator.shape)
     small = min(operator.shape) <= LARGEST_SIDE and operator.shape[0] * operator.shape[1] <= LARGEST_DENSE
-    state = _start(operator, narrow)
-    kept = len(state.values)
-    state = _restart(operator, state, order, narrow, FEW_RESTARTS if small else NARROW_RESTARTS)
+    state = _start(operator, width)
+    state = _restart(operator, state, order, width, FEW_RESTARTS if small else RESTARTS)
     if small:
-        state = _in_full(operator, state, order, narrow)
-    elif wide > narrow:
-        state = _restart(operator, _widen(operator, state, wide), order, wide, RESTARTS)
-    return Subspace(state.left[:, :order], state.right[:, :order], state.values[:kept])
+        state = _in_full(operator, state, order, width)
+    return Subspace(state.left[:, :order], state.right[:, :order], state.values)
 
 
 def _restart(operator: LinearOperator, state: _State, order: int, width: int, restarts: int) -> _State:
