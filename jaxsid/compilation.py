@@ -11,6 +11,7 @@ import os
 import pickle
 import platform
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,6 +53,7 @@ class _Place:
 
 
 _kept: _Folder | None = None
+_one_at_a_time = threading.RLock()  # compiling changes a setting of the whole process
 _in_memory: list[dict[bytes, _Program]] = []  # of each compiled function
 
 
@@ -117,7 +119,9 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
         program = programs.get(key)
         if program is None:
             path = _kept.path / key.hex()
-            program = programs[key] = _read(path) or _compile(function, leaves, tree, path)
+            with _one_at_a_time:
+                program = programs.get(key) or _read(path) or _compile(function, leaves, tree, path)
+                programs[key] = program
         outputs = program.run(*(x for x in leaves if eqx.is_array(x)))
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Place) else x, program.result)
 
@@ -193,7 +197,7 @@ def _compile(function: Callable, leaves: list, tree: Any, path: Path) -> _Progra
         return outputs
 
     # a program that came from JAX's own cache cannot be written again: this name is not found there, nor put there
-    flat.__name__ = f"kept_{getattr(function, '__name__', 'function')}"
+    flat.__name__ = f"own_{getattr(function, '__name__', 'function')}"
     arrays = [x for x in leaves if eqx.is_array(x)]
     with _unseen_by_jax():
         run = jax.jit(flat).lower(*arrays).compile()

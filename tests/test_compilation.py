@@ -1,6 +1,8 @@
 """Programs kept on disk: the same numbers, found again, and never trusted when damaged or when they do not fit."""
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -151,6 +153,25 @@ def test_released_programs_come_back_from_disk(folder: Path, matrix: np.ndarray)
     count = traces.count
     np.testing.assert_array_equal(run(matrix, jnp.asarray(1.0))[0].values, first)
     assert traces.count == count
+
+
+def test_threads_that_begin_together_share_a_program(folder: Path, matrix: np.ndarray):
+    """Compiled once, and unseen by JAX's own cache: what came from there could not be kept."""
+    traces, start = Traces(), threading.Barrier(4)
+    run = traces.fresh()
+
+    def call(_: int):
+        start.wait()
+        return run(matrix, jnp.asarray(3.0))[0].values
+
+    with ThreadPoolExecutor(4) as pool:
+        first, *others = pool.map(call, range(4))
+    for other in others:
+        np.testing.assert_array_equal(other, first)
+    assert traces.count == 1
+    assert not list(folder.parent.glob("jit_own_*"))
+    assert len(list(folder.iterdir())) == 1
+    np.testing.assert_array_equal(traces.fresh()(matrix, jnp.asarray(3.0))[0].values, first)
 
 
 def memory_maps() -> int:

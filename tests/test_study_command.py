@@ -30,10 +30,12 @@ realization = ["era", "era_dc"]
 FILES = {"results.parquet", "summary.parquet", "summary.csv", "report.html", "plan.json", "lock", "parts"}
 
 
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch, request):
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(request):
     """The command keeps compiled programs where the tests keep theirs."""
-    monkeypatch.setenv("JAXSID_CACHE", str(request.config.rootpath / ".pytest_cache" / "jax"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXSID_CACHE", str(request.config.rootpath / ".pytest_cache" / "jax"))
+        yield
 
 
 def call(*arguments):
