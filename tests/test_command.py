@@ -110,7 +110,8 @@ def test_identify_writes_numbers_model_and_report(files):
     assert len(found["modes"]) == 3
     for mode in found["modes"]:
         assert {"frequency_hz", "damping_ratio", "pole", "mac", "emac", "mpc", "msv", "std"} <= set(mode)
-        assert set(mode["std"]) == {"frequency_hz", "damping_ratio"}
+        assert set(mode["std"]) == {"frequency_hz", "damping_ratio", "pole", "shape"}
+        assert set(mode["shape"]) == {"s1", "s2", "s3"}
         assert len(mode["pole"]) == 2
     assert np.shape(found["poles"]) == (6, 2)
     for name in ("mass", "damping", "stiffness"):

@@ -131,7 +131,8 @@ def run(row, seed, **options):
     return identify(model, recorded(model, u, y), **options)
 
 
-@pytest.mark.parametrize("name", ROWS)
+# Every row in `test_accuracy_over_many_records`, which is slow: each new size of a system compiles for long.
+@pytest.mark.parametrize("name", ["one force", "three forces", "drive", "mixed", "free"])
 def test_accuracy_from_one_noisy_record(name):
     row = ROWS[name]
     found = run(row, 1)
@@ -147,7 +148,7 @@ def test_accuracy_from_one_noisy_record(name):
 @pytest.mark.parametrize("name", ROWS)
 def test_accuracy_over_many_records(name):
     row = ROWS[name]
-    for seed in range(2, 8):
+    for seed in range(1, 8):
         found = run(row, seed)
         check(found, row.system, row.limits)
         assert unexpected(found) == []
