@@ -34,7 +34,7 @@ class Target(NamedTuple):
         s: (lines,) j w.
         x: (lines,) where the transients are rational functions: z, or s for band-limited inputs.
         record: (lines, records) which record a line belongs to.
-        dt: the interval after which F = exp(A dt) for x = z; 0 for x = s, where F = A.
+        dt: (records,) the interval of each, after which F = exp(A dt), for x = z; 0 for x = s, where F = A.
         drive: (lines, inputs) spectrum of the held inputs.
         y: (lines, outputs) measured, less what sampling adds.
         weight: (lines, outputs) one over the noise, 0 where nothing was measured.
@@ -43,7 +43,7 @@ class Target(NamedTuple):
     s: Complex[Array, " lines"]
     x: Complex[Array, " lines"]
     record: Float[Array, "lines records"]
-    dt: Float[Array, ""]
+    dt: Float[Array, " records"]
     drive: Complex[Array, "lines inputs"]
     y: Complex[Array, "lines outputs"]
     weight: Float[Array, "lines outputs"]
@@ -91,8 +91,9 @@ def fit_target(
     excess = sampled - _modal_response(model, s, drive)
     weight = lines.weight * jnp.sqrt(2.0) / noise
     band = "band" in lines.hold
-    dt = jnp.zeros_like(lines.dt) if band else lines.dt
-    return Target(s, s if band else lines.z, lines.record, dt, drive, lines.y - excess, weight)
+    dt = jnp.asarray(lines.record_dt, weight.dtype) * (not band)
+    x = s if band else jnp.exp(s * (lines.record @ dt))
+    return Target(s, x, lines.record, dt, drive, lines.y - excess, weight)
 
 
 def _modal_response(model: Realization | ContinuousModel, points: Array, u: Array) -> Array:
@@ -157,14 +158,14 @@ def _lines_and_slopes(
 
 
 def _motion(target: Target, matrices: Triple, slopes: tuple[Array, ...]) -> tuple[Array, Array]:
-    """F, (2N, 2N), and its derivatives to the unknowns, (2N, 2N, p)."""
+    """F of each record, (records, 2N, 2N), and its derivatives to the unknowns, (records, 2N, 2N, p)."""
 
     def advance(M: Array, D: Array, K: Array) -> Array:
         per_mass = jnp.linalg.solve(M, jnp.concatenate([-K, -D], axis=1))
         A = jnp.concatenate([jnp.eye(len(M), 2 * len(M), len(M)), per_mass])
         # exp(A dt) = I + A dt phi_1(A dt); for dt = 0 the transients are those of continuous time
-        held = jnp.eye(len(A)) + A * target.dt @ phi_functions(A * target.dt)[0]
-        return jnp.where(target.dt > 0, held, A)
+        held = jax.vmap(lambda dt: jnp.eye(len(A)) + A * dt @ phi_functions(A * dt)[0])(target.dt)
+        return jnp.where(target.dt[:, None, None] > 0, held, A)
 
     F, push = jax.linearize(advance, *matrices)
     return F, jax.vmap(push, in_axes=-1, out_axes=-1)(*slopes)
@@ -183,7 +184,9 @@ def _without_transients(
         dF: its derivative.
         sensed: gives the sensors.
     """
-    inverse = jnp.linalg.inv(target.x[:, None, None] * jnp.eye(len(F)) - F)
+    F = jnp.einsum("kr,rnm->knm", target.record, F)
+    inverse = jnp.linalg.inv(target.x[:, None, None] * jnp.eye(F.shape[1]) - F)
+    pushes = dF.reshape(len(dF), -1, dF.shape[-1])
     places = sensed.displacement_sensors + sensed.velocity_sensors + sensed.acceleration_sensors
     constant = target.record.astype(inverse.dtype)
 
@@ -197,7 +200,7 @@ def _without_transients(
         state = amplitude[: basis.shape[1]].reshape(target.record.shape[1], -1)
         moved = jnp.einsum("knm,km->kn", inverse, target.record @ state)
         outer = (row[:, :, None] * moved[:, None, :]).reshape(len(row), -1)
-        change = outer @ dF.reshape(-1, dF.shape[-1]).astype(outer.dtype)
+        change = jnp.einsum("kr,kq,rqp->kp", target.record, outer, pushes)
         r, j = _parts(y, weight), _parts(slope - change, weight)
         return r - q @ (q.T @ r), j - q @ (q.T @ j)
 
