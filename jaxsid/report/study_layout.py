@@ -82,14 +82,6 @@ def level_text(value: Level) -> str:
     return minus(f"{value:.4g}") if isinstance(value, float) else str(value)
 
 
-def cases(rows: Sequence[Row]) -> list[list[Row]]:
-    """The rows case by case."""
-    found: dict[int, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row.case, []).append(row)
-    return list(found.values())
-
-
 def failed_share(case: Sequence[Row]) -> float:
     """Share of the realizations of a case that gave no value for its worst quantity."""
     return max(row.failed / (row.failed + row.count) for row in case)

@@ -24,7 +24,6 @@ from jaxsid.report.numbers import MISSING, TIMES, percent, plural, significant, 
 from jaxsid.report.study_figures import quantile_figure, spread_figure
 from jaxsid.report.study_layout import (
     Layout,
-    cases,
     failed_share,
     is_number,
     kinds,
@@ -38,7 +37,7 @@ from jaxsid.report.study_layout import (
 from jaxsid.study.compare import MANY, SIGNIFICANT, Comparison, compare_levels
 from jaxsid.study.configuration import Study
 from jaxsid.study.effects import Effect, estimate_effects
-from jaxsid.study.summary import Row
+from jaxsid.study.summary import Row, by_case
 
 SPREAD_FIGURES, QUANTILE_FIGURES = 6, 6
 CASES, QUANTITIES = 60, 60  # rows of the tables
@@ -86,7 +85,7 @@ def _findings(study: Study, rows: Sequence[Row]) -> Section:
 
 def _cards(study: Study, rows: Sequence[Row]) -> tuple[Card, ...]:
     ratios = [r.std_over_cramer_rao for r in rows if math.isfinite(r.std_over_cramer_rao)]
-    worst = max(cases(rows), key=failed_share)
+    worst = max(by_case(rows), key=failed_share)
     share = failed_share(worst)
     bound = ("unknown", "no bound for these cases")
     if ratios:
@@ -102,7 +101,7 @@ def _cards(study: Study, rows: Sequence[Row]) -> tuple[Card, ...]:
 
 def _failures(study: Study, rows: Sequence[Row]) -> Notice:
     """The cases that failed most often, or that none did."""
-    failing = sorted(cases(rows), key=failed_share, reverse=True)
+    failing = sorted(by_case(rows), key=failed_share, reverse=True)
     messages = tuple(
         f"Case {case[0].case}{_where(study, case[0])}: {percent(failed_share(case))} of the realizations gave no value."
         for case in failing[:5]
@@ -234,7 +233,7 @@ def _quantile_section(rows: Sequence[Row], plan: Layout) -> Section:
 
 
 def _cases_section(study: Study, rows: Sequence[Row]) -> Section:
-    every, names = cases(rows), kinds(rows)
+    every, names = by_case(rows), kinds(rows)
     header = ("Case", *study.varied, *(name.replace("_", " ") for name in names), "Failed")
     body = tuple(
         (
@@ -258,7 +257,7 @@ def _pooled_cell(rows: Sequence[Row]) -> Cell:
 def _quantities_section(study: Study, rows: Sequence[Row]) -> Section:
     header = ("Quantity", "Truth", "Bias", "Std", "Robust std", "Cramér-Rao", "95 % from", "to")
     blocks: list[Block] = []
-    for case in cases(rows):
+    for case in by_case(rows):
         if (
             sum(len(block.rows) for block in blocks if isinstance(block, Table)) + len(case) > QUANTITIES
             and blocks
@@ -271,7 +270,7 @@ def _quantities_section(study: Study, rows: Sequence[Row]) -> Section:
         "The robust standard deviation comes from the middle half: where it is much smaller, a few estimates are far "
         "off."
     )
-    return Section("Quantities", (*_left_out(len(cases(rows)), len(blocks)), Text(note), *blocks))
+    return Section("Quantities", (*_left_out(len(by_case(rows)), len(blocks)), Text(note), *blocks))
 
 
 def _quantity(row: Row) -> tuple[str | Cell, ...]:

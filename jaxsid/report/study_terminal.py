@@ -13,10 +13,10 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from jaxsid.report.numbers import percent
-from jaxsid.report.study_layout import cases, failed_share, kinds, named, pooled
+from jaxsid.report.study_layout import failed_share, kinds, named, pooled
 from jaxsid.study.configuration import Study
 from jaxsid.study.engine import Progress
-from jaxsid.study.summary import Row
+from jaxsid.study.summary import Row, by_case
 
 SECONDS_BETWEEN = 10.0  # lines where there is no terminal
 SHOWN = 40  # cases in the table
@@ -83,7 +83,7 @@ def left(p: Progress) -> str:
 def print_study(study: Study, rows: Sequence[Row], console: Console | None = None) -> None:
     """One line a case: spread of each kind of quantity over the truth, and failures; on standard output."""
     console = Console() if console is None else console
-    every, names = cases(rows), kinds(rows)
+    every, names = by_case(rows), kinds(rows)
     table = Table(
         title=escape(study.name), title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),

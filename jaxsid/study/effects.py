@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsid.study.compare import Level
-from jaxsid.study.summary import Row
+from jaxsid.study.summary import Row, by_case
 
 
 class Effect(NamedTuple):
@@ -42,7 +42,7 @@ def estimate_effects(rows: Sequence[Row], factors: Sequence[str]) -> list[Effect
         rows: summary of a study.
         factors: whose effects are wanted, and are taken to be all that there are.
     """
-    cases = [case for case in _by_case(rows) if math.isfinite(_error(case))]
+    cases = [case for case in by_case(rows) if math.isfinite(_error(case))]
     columns = [
         column for name in factors for column in _columns(name, [case[0].factors[name] for case in cases])
     ]
@@ -61,13 +61,6 @@ def estimate_effects(rows: Sequence[Row], factors: Sequence[str]) -> list[Effect
         effect._replace(value=float(value), error=float(error))
         for (effect, _), value, error in zip(usable, found, errors, strict=True)
     ]
-
-
-def _by_case(rows: Sequence[Row]) -> list[list[Row]]:
-    found: dict[int, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row.case, []).append(row)
-    return list(found.values())
 
 
 def _error(case: Sequence[Row]) -> float:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +61,14 @@ class Row(NamedTuple):
     def kind(self) -> str:
         """The quantity without its number: "frequency", "mass"."""
         return NUMBERS.sub("", self.quantity)
+
+
+def by_case(rows: Sequence[Row]) -> list[list[Row]]:
+    """The rows case by case."""
+    found: dict[int, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row.case, []).append(row)
+    return list(found.values())
 
 
 def summarize(case: Case, facts: Facts, values: Float[np.ndarray, "count quantities"]) -> list[Row]:
