@@ -179,7 +179,7 @@ def study(
     """How noise, sensors and settings spread what is identified: thousands of realizations of many cases."""
     with _errors(), _resumable(out), _study_view(quiet) as view:
         view.say("loading")
-        _numerics()
+        _numerics(hurry=False)
         from jaxsid.report.study_html import write_study_report
         from jaxsid.study.configuration import read_study
         from jaxsid.study.engine import run_study
@@ -235,14 +235,14 @@ def _resumable(out: Path) -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
-def _numerics() -> None:
+def _numerics(*, hurry: bool = True) -> None:
     """Double precision, and compiled programs kept on disk so that the next run starts at once."""
     import jax
 
     from jaxsid.compilation import default_folder, keep_programs
 
     jax.config.update("jax_enable_x64", True)
-    keep_programs(default_folder())
+    keep_programs(default_folder(), hurry=hurry)
 
 
 def _method(choice: Method, records, say):

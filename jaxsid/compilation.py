@@ -29,6 +29,7 @@ from jax.experimental import serialize_executable
 P = ParamSpec("P")
 T = TypeVar("T")
 MOST_BYTES = 500_000_000  # what the folder may hold before the programs unused for longest go
+HURRIED: dict[str, bool | str | int] = {"xla_backend_optimization_level": 0}
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_debug_nans")
 LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
 BUILT_ON = ("jax", "jaxlib", "equinox", "numpy", "scipy")
@@ -38,6 +39,7 @@ LASTING = ("jaxsid", "builtins", *BUILT_ON)
 class _Folder(NamedTuple):
     path: Path
     stamp: bytes
+    options: dict[str, bool | str | int]
 
 
 class _Program(NamedTuple):
@@ -57,7 +59,7 @@ _one_at_a_time = threading.RLock()  # compiling changes a setting of the whole p
 _in_memory: list[dict[bytes, _Program]] = []  # of each compiled function
 
 
-def keep_programs(folder: str | Path | None) -> None:
+def keep_programs(folder: str | Path | None, *, hurry: bool = False) -> None:
     """Keep compiled programs in a folder from now on, or no longer if None.
 
     Programs of this library are named by its sources, the versions of what it is built on, the processor, JAX's
@@ -67,12 +69,13 @@ def keep_programs(folder: str | Path | None) -> None:
 
     Args:
         folder: made when the first program is written. A folder that cannot be written to is no error.
+        hurry: compile with few optimizations, in three quarters of the time, for programs that run only a few times.
     """
     global _kept
     if folder is None:
         _kept = None
         return
-    _kept = _Folder(Path(folder) / "programs", _stamp())
+    _kept = _Folder(Path(folder) / "programs", _stamp(), HURRIED if hurry else {})
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update(LEAST_TIME, 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -113,14 +116,16 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
         if _kept is None:
             return jitted(*args, **kwargs)
         leaves, tree = jax.tree.flatten((args, kwargs))
-        key = _key(function, leaves, tree, _kept.stamp)
+        key = _key(function, leaves, tree, _kept)
         if key is None:
             return jitted(*args, **kwargs)
         program = programs.get(key)
         if program is None:
             path = _kept.path / key.hex()
             with _one_at_a_time:
-                program = programs.get(key) or _read(path) or _compile(function, leaves, tree, path)
+                program = (
+                    programs.get(key) or _read(path) or _compile(function, leaves, tree, path, _kept.options)
+                )
                 programs[key] = program
         outputs = program.run(*(x for x in leaves if eqx.is_array(x)))
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Place) else x, program.result)
@@ -128,7 +133,7 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def _key(function: Callable, leaves: list, tree: Any, stamp: bytes) -> bytes | None:
+def _key(function: Callable, leaves: list, tree: Any, kept: _Folder) -> bytes | None:
     """Name of the program for this call; None where it is traced, or an argument has no name that lasts."""
     if any(isinstance(x, jax.core.Tracer) for x in leaves) or jax.device_count() > 1:
         return None
@@ -137,6 +142,7 @@ def _key(function: Callable, leaves: list, tree: Any, stamp: bytes) -> bytes | N
         jax.default_backend(),
         *(getattr(jax.config, name) for name in SETTINGS),
         os.environ.get("XLA_FLAGS"),
+        kept.options,
     )
     stream = io.BytesIO()
     pickler = _Namer(stream)
@@ -147,7 +153,7 @@ def _key(function: Callable, leaves: list, tree: Any, stamp: bytes) -> bytes | N
         )
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError):
         return None
-    return hashlib.sha256(stamp + stream.getvalue()).digest() if settings[0] == "cpu" else None
+    return hashlib.sha256(kept.stamp + stream.getvalue()).digest() if settings[0] == "cpu" else None
 
 
 class _Namer(pickle.Pickler):
@@ -182,7 +188,7 @@ def _stamp() -> bytes:
     return digest.digest()
 
 
-def _compile(function: Callable, leaves: list, tree: Any, path: Path) -> _Program:
+def _compile(function: Callable, leaves: list, tree: Any, path: Path, options: dict) -> _Program:
     found: list[Any] = []
 
     def flat(*arrays: jax.Array) -> list[Any]:
@@ -200,7 +206,7 @@ def _compile(function: Callable, leaves: list, tree: Any, path: Path) -> _Progra
     flat.__name__ = f"own_{getattr(function, '__name__', 'function')}"
     arrays = [x for x in leaves if eqx.is_array(x)]
     with _unseen_by_jax():
-        run = jax.jit(flat).lower(*arrays).compile()
+        run = jax.jit(flat).lower(*arrays).compile(options)
     program = _Program(run, found[0])
     try:
         payload = serialize_executable.serialize(run)[0]

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+RELATIVE = 1e-12  # of J'J's largest diagonal entry: the least, where `through` makes others vanish
+
 
 class Minimum(NamedTuple):
     """Where a sum of squares is least.
@@ -30,7 +32,9 @@ class _State(NamedTuple):
     product: Array
     gradient: Array
     candidate: Array
+    promised: Array
     damping: Array
+    growth: Array
     steps: Array
     finished: Array
 
@@ -51,49 +55,82 @@ def levenberg_marquardt(
     *,
     max_steps: int | Array,
     tolerance: float | Array = 1e-10,
+    through: Callable[[Array], Array] | None = None,
 ) -> Minimum:
     """The unknowns that minimize half a sum of squares, by Levenberg and Marquardt.
 
-    Steps solve (J'J + l diag(J'J)) d = -J'r; l falls tenfold after a step that helps and rises tenfold after
-    one that does not, which is then undone. Only J'J and J'r are kept from step to step.
+    Steps solve (J'J + l diag(J'J)) d = -J'r. After a step that helps l falls, the more the better the parabola
+    foretold the gain; after one that does not, which is undone, it rises faster and faster. Only J'J and J'r are kept
+    from step to step.
 
     Args:
         evaluate: maps the unknowns to the weighted residual (equations,) and its Jacobian (equations, n).
         start: (n,).
         max_steps: most evaluations.
         tolerance: stop when a helpful step lowers the cost by less than this part.
+        through: the unknowns are put through this map before `evaluate` sees them. Its curvature is taken into
+            account, as a map that keeps to a set of allowed values needs where the best ones lie on the edge.
 
-    Source: D. Marquardt, J. SIAM 11 (1963).
+    Source: D. Marquardt, J. SIAM 11 (1963); the rule for l: H. B. Nielsen, IMM-REP-1999-05, DTU.
     """
+    tiny = jnp.finfo(start.dtype).tiny
 
     def products(value: Array) -> tuple[Array, Array, Array]:
-        r, j = evaluate(value)
+        r, j = evaluate(value if through is None else through(value))
         return 0.5 * r @ r, j.T @ j, j.T @ r
 
-    def step(product: Array, gradient: Array, damping: Array) -> Array:
-        scale = jnp.sqrt(jnp.maximum(jnp.diag(product), jnp.finfo(start.dtype).tiny))
-        normal = product / scale / scale[:, None] + damping * jnp.eye(len(start))
-        return -jnp.linalg.solve(normal, gradient / scale) / scale
+    def step(value: Array, product: Array, gradient: Array, damping: Array) -> tuple[Array, Array]:
+        """The candidate, and by how much the cost should fall."""
+        if through is None:
+            scale = jnp.sqrt(jnp.maximum(jnp.diag(product), tiny))
+            scaled = product / scale / scale[:, None]
+        else:
+            put, outer = through, gradient
+            product, gradient = _pulled_back(put, value, product, outer)
+            size = jnp.diag(product)
+            scale = jnp.sqrt(jnp.maximum(size, RELATIVE * size.max()))
+            scaled = (product + jax.hessian(lambda v: outer @ put(v))(value)) / scale / scale[:, None]
+            damping = jnp.maximum(damping, -1.1 * jnp.linalg.eigvalsh(scaled)[0])
+        downhill = -gradient / scale
+        d = jnp.linalg.solve(scaled + damping * jnp.eye(len(start)), downhill)
+        return value + d / scale, downhill @ d - 0.5 * d @ scaled @ d
 
     # the start is the first candidate, so that the evaluation is compiled once
     def advance(state: _State) -> _State:
         found = products(state.candidate)
         better, first = found[0] < state.cost, state.steps == 0
-        gained = (state.cost - found[0]) / jnp.maximum(state.cost, jnp.finfo(start.dtype).tiny)
-        finished = jnp.where(better, gained < tolerance, state.damping > 1e8) & ~first
+        gain = state.cost - found[0]
+        small = gain < tolerance * jnp.maximum(state.cost, tiny)
+        finished = jnp.where(better, small, state.damping > 1e10) & ~first
         keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
         value, (cost, product, gradient) = (
             keep(state.candidate, state.value),
             map(keep, found, (state.cost, state.product, state.gradient)),
         )
-        changed = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), state.damping * 10)
-        damping = jnp.where(first, state.damping, changed)
-        candidate = value + step(product, gradient, damping)
-        return _State(value, cost, product, gradient, candidate, damping, state.steps + 1, finished)
+        foretold = gain / jnp.maximum(state.promised, tiny)
+        eased = state.damping * jnp.maximum(1 - (2 * foretold - 1) ** 3, 0.1)
+        damping = jnp.where(better, jnp.maximum(eased, 1e-12), state.damping * state.growth)
+        damping = jnp.where(first, state.damping, damping)
+        growth = jnp.where(better, 2.0, 2 * state.growth)
+        candidate, promised = step(value, product, gradient, damping)
+        return _State(
+            value, cost, product, gradient, candidate, promised, damping, growth, state.steps + 1, finished
+        )
 
-    most = jnp.asarray(jnp.inf, start.dtype)
-    nothing = jnp.eye(len(start), dtype=start.dtype), jnp.zeros_like(start)
-    damping = jnp.asarray(1e-3, start.dtype)
-    state = _State(start, most, *nothing, start, damping, jnp.array(0), jnp.array(False))
+    most, one = jnp.asarray(jnp.inf, start.dtype), jnp.ones((), start.dtype)
+    seen = start if through is None else through(start)
+    nothing = jnp.eye(len(seen), dtype=start.dtype), jnp.zeros_like(seen)
+    state = _State(start, most, *nothing, start, one, 1e-3 * one, 2 * one, jnp.array(0), jnp.array(False))
     last = jax.lax.while_loop(lambda s: ~s.finished & (s.steps < max_steps), advance, state)
-    return Minimum(last.value, last.cost, last.product, last.steps)
+    product = last.product
+    if through is not None:
+        product, _ = _pulled_back(through, last.value, last.product, last.gradient)
+    return Minimum(last.value, last.cost, product, last.steps)
+
+
+def _pulled_back(
+    through: Callable[[Array], Array], value: Array, product: Array, gradient: Array
+) -> tuple[Array, Array]:
+    """J'J and J'r for the unknowns that `through` starts from."""
+    slopes = jax.jacfwd(through)(value)
+    return slopes.T @ product @ slopes, slopes.T @ gradient

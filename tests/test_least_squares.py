@@ -75,6 +75,30 @@ def test_steps_that_leave_the_domain_are_refused():
     np.testing.assert_allclose(found.value, np.exp([-3.0, 2.0]), rtol=1e-6)
 
 
+def test_the_nearest_positive_matrix_is_reached_on_the_edge():
+    """Closed form: negative eigenvalues become zero (N. Higham, Linear Algebra Appl. 103, 1988)."""
+    rng = np.random.default_rng(3)
+    goal = rng.standard_normal((5, 5))
+    goal = goal + goal.T
+    weight = np.where(np.eye(5) > 0, 1.0, np.sqrt(2.0))[np.triu_indices(5)]
+
+    def positive(theta):
+        lower = jnp.zeros((5, 5)).at[np.tril_indices(5)].set(theta)
+        return (lower @ lower.T)[np.triu_indices(5)]
+
+    def evaluate(upper):
+        return weight * (upper - goal[np.triu_indices(5)]), jnp.diag(jnp.asarray(weight))
+
+    values, vectors = np.linalg.eigh(goal)
+    assert (values < 0).sum() == 2
+    nearest = (vectors * np.maximum(values, 0)) @ vectors.T
+    for seed in range(3):
+        start = jnp.eye(5)[np.tril_indices(5)] + 0.1 * np.random.default_rng(seed).standard_normal(15)
+        found = levenberg_marquardt(evaluate, start, max_steps=300, tolerance=1e-15, through=positive)
+        np.testing.assert_allclose(positive(found.value), nearest[np.triu_indices(5)], atol=1e-5)
+        np.testing.assert_allclose(found.cost, 0.5 * np.sum(values[values < 0] ** 2), rtol=1e-9)
+
+
 def test_the_limit_of_steps_holds():
     found = fit(Y, max_steps=3)
     assert int(found.steps) == 3

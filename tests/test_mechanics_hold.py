@@ -10,7 +10,7 @@ from test_mechanics_first_order import CHAIN, FREE, OVERDAMPED, RIG, model
 
 from jaxsid.checks import InputError, InsufficientDataError
 from jaxsid.mechanics.first_order import physical_displacement_momentum, physical_displacement_velocity
-from jaxsid.mechanics.functions_of_matrices import logarithm, phi_functions
+from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes, logarithm, phi_functions
 from jaxsid.mechanics.hold import continuous, discretise, laguerre_to_shift, shift_to_laguerre
 from jaxsid.records import ContinuousModel, Realization
 
@@ -97,6 +97,19 @@ def test_phi_functions_against_scipy():
         one, two = jax.jit(phi_functions)(L)
         close(one, big[:5, 5:10], 1e-12)
         close(two, big[:5, 10:], 1e-12)
+
+
+def test_exponential_and_its_slopes_against_scipy():
+    rng = np.random.default_rng(4)
+    for size in (1e-8, 0.1, 5.0, 40.0):
+        S = rng.normal(size=(5, 5))
+        L = size * (S - S.T - np.eye(5))
+        directions = rng.normal(size=(3, 5, 5))
+        found = jax.jit(exponential_with_slopes)(np.concatenate([L[None], directions]))
+        np.testing.assert_allclose(found[0], scipy.linalg.expm(L), rtol=0, atol=1e-12)
+        for slope, direction in zip(found[1:], directions, strict=True):
+            truth = scipy.linalg.expm_frechet(L, direction, compute_expm=False)
+            np.testing.assert_allclose(slope, truth, rtol=0, atol=1e-12)
 
 
 def test_each_input_has_its_own_hold():

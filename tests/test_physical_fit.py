@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from band_limited import DT, band_noise, chain, error, respond, state_space
-from scipy import signal
+from scipy import linalg, signal
 
 from jaxsid.impulse.lines import record_lines
-from jaxsid.physical.inband_fit import _lines_and_slopes, fit_matrices, fit_target
+from jaxsid.physical.inband_fit import _lines_and_slopes, _motion, _symmetric, fit_matrices, fit_target
 from jaxsid.physical.parameterization import PositiveMatrices, SymmetricMatrices, entry_sizes
 from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderModel
 
@@ -93,11 +93,63 @@ def test_positive_matrices_are_positive_whatever_the_unknowns():
 
 
 def test_slopes_are_those_of_automatic_differentiation():
-    goal, both = target(0.01), parameters(SymmetricMatrices)
-    theta = both.unknowns(tuple(map(jnp.asarray, TRUTH)))
-    model = lambda t: _lines_and_slopes(goal, both.matrices(t), jax.jacfwd(both.matrices)(t), SENSED)  # noqa: E731
-    slopes = jax.jit(model)(theta)[1]
-    other = jax.jit(jax.jacfwd(lambda t: model(t)[0]))(theta)
+    goal = target(0.01)
+    upper = jnp.concatenate([x[np.triu_indices(2)] for x in TRUTH])
+    model = lambda x: _lines_and_slopes(goal, _symmetric(x, 2), SENSED)  # noqa: E731
+    slopes = jax.jit(model)(upper)[1]
+    other = jax.jit(jax.jacfwd(lambda x: model(x)[0]))(upper)
     np.testing.assert_allclose(
         slopes, jnp.moveaxis(other, 2, 1), rtol=1e-8, atol=1e-9 * float(jnp.abs(other).max())
     )
+
+
+def test_transients_move_with_the_matrices_as_scipys_exponential_does():
+    goal = target(0.01)
+    F, slopes = jax.jit(lambda m: _motion(goal, m))(tuple(map(jnp.asarray, TRUTH)))
+    A = lambda M, D, K: np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, np.hstack([K, D]))]])  # noqa: E731
+    np.testing.assert_allclose(F[0], linalg.expm(A(*TRUTH) * DT), rtol=1e-12, atol=1e-12)
+    entries = list(zip(*np.triu_indices(2), strict=True))
+    for k, (kind, (i, j)) in enumerate((kind, at) for kind in range(3) for at in entries):
+        size = 1e-6 * np.abs(TRUTH[kind]).max()
+        change = np.zeros((2, 2))
+        change[i, j] = change[j, i] = size
+        moved = [
+            linalg.expm(A(*(x + sign * change * (n == kind) for n, x in enumerate(TRUTH))) * DT)
+            for sign in (1, -1)
+        ]
+        numeric = (moved[0] - moved[1]) / (2 * size)
+        np.testing.assert_allclose(
+            slopes[0, :, :, k], numeric, rtol=1e-5, atol=1e-7 * float(np.abs(numeric).max())
+        )
+
+
+def test_the_best_positive_matrices_are_found_on_the_edge_from_anywhere():
+    """Data of a damping matrix with a negative eigenvalue: the best positive one is singular."""
+    active = TRUTH[1] + np.array([[0.0, -0.7], [-0.7, 0.0]])
+    assert np.linalg.eigvalsh(active)[0] < -0.05
+    system = SYSTEM._replace(damping=active)
+    rng = np.random.default_rng(5)
+    u = band_noise(rng, 8000, 1)
+    y = respond(system, u)
+    size = 0.05 * y.std(axis=0)
+    A, B, C, D, _ = signal.cont2discrete(state_space(system), DT)
+    lines = record_lines([Record(u, y + size * rng.standard_normal(y.shape), DT)])
+    goal = fit_target(
+        lines,
+        jnp.broadcast_to(jnp.asarray(size), lines.y.shape),
+        Realization(A, B, C, D, DT),
+        ContinuousModel(*map(jnp.asarray, state_space(system))),
+    )
+    free = fit_matrices(goal, parameters(SymmetricMatrices), tuple(map(jnp.asarray, TRUTH)), SENSED)
+    assert np.linalg.eigvalsh(free.matrices[1])[0] < 0
+    starts = (free.matrices, tuple(map(jnp.asarray, TRUTH)), tuple(jnp.asarray(1.1 * x) for x in TRUTH))
+    fits = [fit_matrices(goal, parameters(PositiveMatrices), start, SENSED) for start in starts]
+    misfits = [float(fit.misfit) for fit in fits]
+    assert misfits[0] > float(free.misfit)
+    np.testing.assert_allclose(misfits, misfits[0], rtol=1e-5)
+    for fit in fits:
+        values = np.linalg.eigvalsh(fit.matrices[1])
+        assert abs(values[0]) < 1e-6 * values[1]
+        for x, deviation in zip(fit.matrices, fit.deviation, strict=True):
+            assert np.isfinite(deviation).all()
+            assert (deviation < 0.2 * np.abs(x).max()).all()

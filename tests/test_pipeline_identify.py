@@ -222,7 +222,7 @@ def test_two_sampling_rates_of_one_system(model):
 
 def test_two_sampling_rates_without_noise_are_exactly_one_system(model):
     records = [recorded(model, *experiment(SYSTEM, 6, noise=0.0, dt=dt), dt) for dt in (1e-3, 2e-3)]
-    check(identify(model, records), SYSTEM, Limits(1e-4, 1e-3, 1e-3, 1e-2))
+    check(identify(model, records), SYSTEM, Limits(1e-8, 1e-7, 1e-7, 1e-6))
 
 
 def test_a_roving_sensor(model):

@@ -86,13 +86,16 @@ def laguerre_pole(band_end: float, dt: float) -> float:
 
 @compiled
 def line_level(
-    x: Complex[Array, "lines outputs"], weight: Float[Array, "lines outputs"]
+    x: Complex[Array, "lines outputs"],
+    weight: Float[Array, "lines outputs"],
+    left: Float[Array, "lines outputs"] | float = 1.0,
 ) -> Float[Array, "lines outputs"]:
     """Root of the mean square of lines over their neighbours of the same output, never below 1e-12 of the largest.
 
     Args:
         x: one value a line and output.
         weight: 1 where it was measured, else 0.
+        left: part of the noise power that the fit left in each line: around a lightly damped mode it fits noise too.
     """
     count = len(x)
     low = jnp.maximum(jnp.arange(count) - NEIGHBOURS, 0)
@@ -102,7 +105,7 @@ def line_level(
         total = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(v, axis=0)])
         return total[high] - total[low]
 
-    power = average(jnp.abs(x) ** 2 * weight) / jnp.maximum(average(weight), 1.0)
+    power = average(jnp.abs(x) ** 2 * weight) / jnp.maximum(average(weight * left), 1.0)
     return jnp.sqrt(jnp.maximum(power, 1e-24 * power.max(axis=0) + jnp.finfo(x.real.dtype).tiny))
 
 

@@ -15,16 +15,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
-from jaxsid.mechanics.functions_of_matrices import phi_functions
+from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
 from jaxsid.physical.parameterization import Parameterization, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
-STEPS = 80
+STEPS = 200
+STILL = (
+    1e-4  # an unknown that moves M, D, K less than this, next to the one that moves them most, is at an edge
+)
 
 
 class Target(NamedTuple):
@@ -116,22 +120,25 @@ def fit_matrices(
         sensed: gives the input matrix and the sensors; its matrices are not used.
     """
 
-    def evaluate(theta: Array) -> tuple[Array, Array]:
-        matrices, slopes = parameterization.matrices(theta), jax.jacfwd(parameterization.matrices)(theta)
-        model, derivative = _lines_and_slopes(target, matrices, slopes, sensed)
-        return _without_transients(
-            target, target.y - model, -derivative, *_motion(target, matrices, slopes), sensed
-        )
+    size = len(sensed.mass)
 
-    found = levenberg_marquardt(evaluate, parameterization.unknowns(start), max_steps=STEPS)
-    scale = jnp.sqrt(jnp.diag(found.jacobian_product))
-    amplitudes = target.record.shape[1] * (2 * len(sensed.mass) + 1) * target.weight.shape[1]
+    def entries(theta: Array) -> Array:
+        return jnp.concatenate([x[np.triu_indices(size)] for x in parameterization.matrices(theta)])
+
+    def evaluate(upper: Array) -> tuple[Array, Array]:
+        matrices = _symmetric(upper, size)
+        model, slopes = _lines_and_slopes(target, matrices, sensed)
+        return _without_transients(target, target.y - model, -slopes, *_motion(target, matrices), sensed)
+
+    theta = parameterization.unknowns(start)
+    found = levenberg_marquardt(evaluate, theta, max_steps=STEPS, through=entries)
+    amplitudes = target.record.shape[1] * (2 * size + 1) * target.weight.shape[1]
     free = amplitudes + len(found.value)
     equations = 2 * (target.weight > 0).sum()
     misfit = 2 * found.cost / jnp.maximum(equations - free, 1.0)
-    covariance = jnp.linalg.inv(found.jacobian_product / scale / scale[:, None]) / scale / scale[:, None]
-    covariance = covariance * jnp.maximum(misfit, 1.0)
-    slopes = jax.jacfwd(parameterization.matrices)(found.value)
+    both = jax.vmap(jax.jacfwd(parameterization.matrices))(jnp.stack([theta, found.value]))
+    before, slopes = tuple(x[0] for x in both), tuple(x[1] for x in both)
+    covariance = _covariance(found.jacobian_product, before, slopes) * jnp.maximum(misfit, 1.0)
     d_mass, d_damping, d_stiffness = (
         jnp.sqrt(jnp.maximum(jnp.einsum("ijp,pq,ijq->ij", x, covariance, x), 0.0)) for x in slopes
     )
@@ -140,35 +147,76 @@ def fit_matrices(
     )
 
 
-def _lines_and_slopes(
-    target: Target, matrices: Triple, slopes: tuple[Float[Array, "N N p"], ...], sensed: SecondOrderModel
-) -> tuple[Array, Array]:
-    """Modelled lines (lines, outputs) and their derivatives (lines, unknowns, outputs)."""
+def _covariance(product: Array, before: tuple[Array, ...], slopes: tuple[Array, ...]) -> Array:
+    """Inverse of J'J over the unknowns that move M, D, K; at the edge of what is allowed some no longer do.
+
+    Args:
+        product: J'J.
+        before: slopes of M, D, K at the start, well inside.
+        slopes: where the fit ended.
+    """
+    usual, moved = (jnp.concatenate([s.reshape(-1, s.shape[-1]) for s in x]) for x in (before, slopes))
+    size = jnp.linalg.norm(usual, axis=1, keepdims=True)
+    moved = moved / jnp.where(size > 0, size, 1.0)
+    reach, directions = jnp.linalg.eigh(moved.T @ moved)
+    directions = directions * (reach > STILL**2 * reach[-1])
+    within = directions.T @ product @ directions
+    scale = jnp.sqrt(jnp.diag(within))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    within = within / scale / scale[:, None] + jnp.diag(1.0 * (jnp.diag(within) == 0))
+    directions = directions / scale
+    return directions @ jnp.linalg.solve(within, directions.T)
+
+
+def _symmetric(upper: Float[Array, "*shape entries"], size: int) -> tuple[Array, Array, Array]:
+    """M, D, K from their upper triangles, row by row, (..., entries)."""
+    at = np.zeros((size, size), int)
+    at[np.triu_indices(size)] = np.arange(size * (size + 1) // 2)
+    at = np.maximum(at, at.T)
+    M, D, K = (x[..., at] for x in jnp.split(upper, 3, axis=-1))
+    return M, D, K
+
+
+def _state_matrix(matrices: Triple) -> Array:
+    """A of displacements and velocities, (2N, 2N)."""
+    M, D, K = matrices
+    per_mass = jnp.linalg.solve(M, jnp.concatenate([-K, -D], axis=1))
+    return jnp.concatenate([jnp.eye(len(M), 2 * len(M), len(M)), per_mass])
+
+
+def _lines_and_slopes(target: Target, matrices: Triple, sensed: SecondOrderModel) -> tuple[Array, Array]:
+    """Modelled lines (lines, outputs) and their derivatives (lines, entries, outputs) to the upper triangles."""
     s = target.s[:, None, None]
     M, D, K = matrices
     inverse = jnp.linalg.inv(M * s**2 + D * s + K)
     x = jnp.einsum("kab,kb->ka", inverse, target.drive @ sensed.input_matrix.T)
     seen = sensed.displacement_sensors + s * sensed.velocity_sensors + s**2 * sensed.acceleration_sensors
-    p = seen @ inverse
+    p = jnp.swapaxes(seen @ inverse, 1, 2)
     model = jnp.einsum("koa,ka->ko", seen, x)
-    outer = (p[:, :, :, None] * x[:, None, None, :]).reshape(len(x), len(seen[0]), -1)
-    flat = [d.reshape(-1, d.shape[-1]).astype(outer.dtype) for d in slopes]
-    change = outer @ flat[0] * s**2 + outer @ flat[1] * s + outer @ flat[2]
-    return model, -jnp.swapaxes(change, 1, 2)
+    i, j = np.triu_indices(len(M))
+    x = x[:, :, None]
+    change = p[:, i] * x[:, j] + jnp.where((i != j)[:, None], p[:, j] * x[:, i], 0.0)
+    return model, -jnp.concatenate([change * s**2, change * s, change], axis=1)
 
 
-def _motion(target: Target, matrices: Triple, slopes: tuple[Array, ...]) -> tuple[Array, Array]:
-    """F of each record, (records, 2N, 2N), and its derivatives to the unknowns, (records, 2N, 2N, p)."""
-
-    def advance(M: Array, D: Array, K: Array) -> Array:
-        per_mass = jnp.linalg.solve(M, jnp.concatenate([-K, -D], axis=1))
-        A = jnp.concatenate([jnp.eye(len(M), 2 * len(M), len(M)), per_mass])
-        # exp(A dt) = I + A dt phi_1(A dt); for dt = 0 the transients are those of continuous time
-        held = jax.vmap(lambda dt: jnp.eye(len(A)) + A * dt @ phi_functions(A * dt)[0])(target.dt)
-        return jnp.where(target.dt[:, None, None] > 0, held, A)
-
-    F, push = jax.linearize(advance, *matrices)
-    return F, jax.vmap(push, in_axes=-1, out_axes=-1)(*slopes)
+def _motion(target: Target, matrices: Triple) -> tuple[Array, Array]:
+    """F of each record, (records, 2N, 2N), and its derivatives to the upper triangles, (records, 2N, 2N, entries)."""
+    M, _, K = matrices
+    size = len(M)
+    A = _state_matrix(matrices)
+    one = _symmetric(jnp.eye(3 * size * (size + 1) // 2), size)  # dM, dD, dK of each entry
+    pushed = -jnp.linalg.solve(M, jnp.concatenate([one[2], one[1]], axis=2) + one[0] @ A[size:])
+    stack = jnp.concatenate([A[None], jnp.concatenate([jnp.zeros_like(pushed), pushed], axis=1)])
+    # displacements in units in which they are about as large as velocities
+    rate = jnp.sqrt(jnp.trace(K) / jnp.trace(M))
+    units = jnp.where(jnp.arange(2 * size) < size, 1.0, jnp.where(rate > 0, rate, 1.0))
+    levelled = stack * units / units[:, None]
+    held = jax.lax.map(lambda dt: exponential_with_slopes(levelled * dt), target.dt) / (
+        units / units[:, None]
+    )
+    # for dt = 0 the transients are those of continuous time
+    every = jnp.where(target.dt[:, None, None, None] > 0, held, stack)
+    return every[:, 0], jnp.moveaxis(every[:, 1:], 1, -1)
 
 
 def _without_transients(

@@ -25,7 +25,7 @@ class SymmetricMatrices(eqx.Module):
 
     Attributes:
         scale: (3, N, N) size of each entry, so that the unknowns are of order one.
-        complements: bases of the coordinates that M, D and K act on, (N, N), (N, q), (N, p).
+        complements: orthonormal bases of the coordinates that M, D and K act on, (N, N), (N, q), (N, p).
     """
 
     scale: tuple[Matrix, Matrix, Matrix]
@@ -43,7 +43,7 @@ class SymmetricMatrices(eqx.Module):
         """Upper triangles of M, D, K in their coordinates."""
         parts = []
         for matrix, scale, e in zip(matrices, self.scale, self.complements, strict=True):
-            inner = jnp.linalg.pinv(e) @ matrix @ jnp.linalg.pinv(e).T / scale
+            inner = jnp.asarray(e).T @ matrix @ e / scale
             parts.append((0.5 * (inner + inner.T))[np.triu_indices(len(scale))])
         return jnp.concatenate(parts)
 
@@ -76,13 +76,13 @@ class PositiveMatrices(eqx.Module):
         return M, D, K
 
     def unknowns(self, matrices: Triple) -> Array:
-        """Lower factors; eigenvalues that are not positive are lifted to 1e-4 of the largest."""
+        """Lower factors; eigenvalues below 1 % of the largest are lifted to that."""
         parts = []
         for matrix, scale, e in zip(matrices, self.scale, self.complements, strict=True):
             root = jnp.sqrt(jnp.diag(scale))
-            inner = jnp.linalg.pinv(e) @ matrix @ jnp.linalg.pinv(e).T / root / root[:, None]
+            inner = jnp.asarray(e).T @ matrix @ e / root / root[:, None]
             values, vectors = jnp.linalg.eigh(0.5 * (inner + inner.T))
-            values = jnp.maximum(values, 1e-4 * jnp.abs(values).max(initial=0.0))
+            values = jnp.maximum(values, 0.01 * jnp.abs(values).max(initial=0.0))
             lower = jnp.linalg.cholesky((vectors * values) @ vectors.T)
             parts.append(lower[np.tril_indices(len(scale))])
         return jnp.concatenate(parts)
@@ -102,7 +102,7 @@ def entry_sizes(
     """
     sizes = []
     for matrix, e in zip((matrices[0], 0.01 * rate * matrices[0], matrices[2]), complements, strict=True):
-        diagonal = np.abs(np.diag(np.linalg.pinv(e) @ matrix @ np.linalg.pinv(e).T))
+        diagonal = np.abs(np.diag(e.T @ matrix @ e))
         root = np.sqrt(np.maximum(diagonal, 1e-6 * diagonal.max(initial=0.0)))
         sizes.append(root * root[:, None])
     return sizes[0], sizes[1], sizes[2]

@@ -116,23 +116,30 @@ def _best_fit(
     sensed: SecondOrderModel,
     structured: SecondOrderModel | None,
 ) -> tuple[MatrixFit | None, bool]:
-    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether the edge held it."""
+    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether the edge held it.
+
+    From there it goes on among positive matrices where it left them.
+    """
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     every, moving, strained = np.eye(len(model.bodies)), _complement(system.loose), _complement(system.rigid)
     complements = every, moving, strained
-    best, held = None, False
+    best = None
     for start in _starts(space, sensed, structured):
-        sizes = entry_sizes(start, complements, _rate(space))
-        for kind in (SymmetricMatrices, PositiveMatrices):
-            parameters = kind(sizes, complements)
-            fit = fit_matrices(target, parameters, start, sensed)
-            if _positive(fit.matrices) and np.isfinite(fit.misfit):
-                if best is None or float(fit.misfit) < float(best.misfit):
-                    best, held = fit, kind is PositiveMatrices
-                break
+        parameters = SymmetricMatrices(entry_sizes(start, complements, _rate(space)), complements)
+        fit = fit_matrices(target, parameters, start, sensed)
+        if np.isfinite(fit.misfit) and (best is None or fit.misfit < best.misfit):
+            best = fit
         if best is not None and float(best.misfit) < GOOD:
             break
-    return best, held and best is not None and float(best.misfit) > GOOD  # below that noise explains it
+    if best is None or _positive(best.matrices):
+        return best, False
+    mass, damping, stiffness = (np.asarray(x) for x in best.matrices)
+    sizes = entry_sizes((mass, damping, stiffness), complements, _rate(space))
+    parameters = PositiveMatrices(sizes, complements)
+    best = fit_matrices(target, parameters, best.matrices, sensed)
+    if not (np.isfinite(best.misfit) and _positive(best.matrices)):
+        return None, False
+    return best, float(best.misfit) > GOOD  # below that noise explains it
 
 
 def _complement(patterns: np.ndarray) -> np.ndarray:

@@ -21,6 +21,8 @@ from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
 # Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
 LAGS = 5
 CLEARLY = 0.1  # less noise, in logarithm, before a growing pole is believed
+RATE_ROUNDS = 8  # of bringing records to a common rate by a model, each several times nearer than the last
+SETTLED = 1e-3  # of the noise: a change of a line that the model no longer feels
 GROWTH = 1e4  # over a record, beyond which a pole is unstable and not a free body's in noise
 
 
@@ -94,9 +96,12 @@ def state_space(
             f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
             "order, widen the band of the excitation, or lengthen the record."
         )
-    if len(set(lines.record_dt)) > 1:
-        lines = _common_rate(lines, polished.realization)
+    given = lines
+    for _ in range(RATE_ROUNDS if len(set(given.record_dt)) > 1 else 0):
+        before, lines = lines, _common_rate(given, polished.realization)
         polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines, stable=stable)
+        if np.all(np.abs(lines.y - before.y) < SETTLED * np.asarray(polished.noise)):
+            break
     measured = raw
     if not _holds(raw, polished.realization):
         measured = _realize(response, min(2 * order_used, int(diagram.order.max())), realization)
@@ -149,7 +154,9 @@ def _reason(raw: Realization, order: int | None, expected: int) -> str:
     values = np.asarray(raw.singular_values)
     if order is not None:
         return f"Order {order} was asked for; bodies and sensors of the model have {expected} visible states."
-    drops = values[:-1] / np.maximum(values[1:], np.finfo(float).tiny)
+    drops = values[:-1] / np.maximum(
+        values[1:], np.finfo(values.dtype).eps * values[0]
+    )  # below it is rounding
     steepest = int(np.argmax(drops[1:])) + 2
     compared = "more than after any other" if steepest == expected else (
         f"{drops[steepest - 1]:.3g} times after {steepest}"

@@ -202,13 +202,18 @@ def _fit(
     theta, covariance = found.value, jnp.linalg.inv(found.jacobian_product)
     design = _design(theta, lines, pole)
     weight = lines.weight / noise
-    response = jax.lax.map(lambda pair: _solve(design, *pair)[2], (lines.y.T, weight.T)).T
+
+    def one_output(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        q, _, coefficients = _solve(design, *pair)
+        return coefficients, (q**2).sum(axis=1).reshape(2, -1).mean(axis=0)
+
+    response, fitted = (x.T for x in jax.lax.map(one_output, (lines.y.T, weight.T)))
     residual = (lines.y - design @ response) * lines.weight
     inputs, records = lines.u.shape[1], lines.record.shape[1]
     response = response.reshape(-1, inputs + records, lines.y.shape[1])
     sections = _sections(theta, laguerre_shift(lines.z, pole))
     transient = jnp.einsum("ks,kr,srm->km", sections, lines.record, response[:, inputs:])
-    return theta, line_level(residual, lines.weight), response, residual, transient, covariance
+    return theta, line_level(residual, lines.weight, 1 - fitted), response, residual, transient, covariance
 
 
 @compiled
