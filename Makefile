@@ -24,7 +24,7 @@ test: lint
 	$(BIN)/python -m $(CHECKED) -m "not slow"
 
 test-all: lint
-	$(BIN)/python -m $(CHECKED)
+	JAXSID_OPTIMIZED=1 $(BIN)/python -m $(CHECKED)
 
 # The peers live in an environment of their own; the figures go into benchmarks/README.md.
 bench: $(STAMP) $(PEERS)/.installed

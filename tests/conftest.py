@@ -6,6 +6,9 @@ from pathlib import Path
 
 # XLA logs an error line for each program read back from the cache, over two tuning flags of its own.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# Most of a run is compilation, which the command, too, does in a hurry; `make test-all` optimizes in full.
+if not os.environ.get("JAXSID_OPTIMIZED"):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
 
 import jax
 import pytest

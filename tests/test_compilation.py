@@ -51,6 +51,15 @@ def matrix() -> np.ndarray:
     return np.random.default_rng(0).normal(size=(5, 5))
 
 
+def test_programs_compiled_in_a_hurry_are_kept_apart_and_give_the_same(folder: Path, matrix: np.ndarray):
+    traces = Traces()
+    careful = traces.fresh()(matrix, jnp.asarray(2.0))
+    keep_programs(folder.parent, hurry=True)
+    hurried = traces.fresh()(matrix, jnp.asarray(2.0))
+    assert (traces.count, len(list(folder.iterdir()))) == (2, 2)
+    np.testing.assert_allclose(hurried[0].values, careful[0].values, rtol=1e-12)
+
+
 def test_a_second_process_reads_what_the_first_compiled(folder: Path, matrix: np.ndarray):
     traces = Traces()
     first = traces.fresh()(matrix, jnp.asarray(2.0), power=2, word="kept")
