@@ -1,6 +1,7 @@
 """The eigensystem realization algorithm (ERA)."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +11,20 @@ from jaxsid.compilation import compiled
 from jaxsid.mechanics.hold import laguerre_to_shift
 from jaxsid.realization.hankel import DenseOperator, hankel_operator
 from jaxsid.realization.order import select_order
+from jaxsid.realization.outputs import few_outputs
 from jaxsid.realization.subspace import (
+    OVERSAMPLING,
     LinearOperator,
     Subspace,
     dominant_subspace,
     leading_values,
     small_enough,
 )
-from jaxsid.realization.window import check_method, check_order, check_response, era_window
+from jaxsid.realization.window import Window, check_method, check_order, check_response, era_window
 from jaxsid.records import ImpulseResponse, Realization
 
 LARGEST_CANDIDATE = 40  # orders that are weighed when none is given
+WORTHWHILE = 3  # times as many outputs as directions, before these are tried
 
 
 def era(
@@ -110,10 +114,10 @@ def balanced(
     return a, u * root, (products / root).T
 
 
-def named_factors(space: Subspace, observability: Array, controllability: Array) -> dict[str, Array]:
-    """The factors by the names they have in a Realization."""
+def named_factors(values: Array, observability: Array, controllability: Array) -> dict[str, Array]:
+    """Singular values and balanced factors by the names they have in a Realization."""
     return {
-        "singular_values": space.values,
+        "singular_values": values,
         "observability": observability,
         "controllability": controllability,
     }
@@ -121,12 +125,51 @@ def named_factors(space: Subspace, observability: Array, controllability: Array)
 
 @compiled
 def _era(h, pole, window, order, full):
+    width = order // 2 + OVERSAMPLING  # a mode has one shape for its two poles, if that is real
+    if full or h.shape[1] < WORTHWHILE * width:
+        a, observability, controllability, values = _factors(h, window, order, full)
+    else:
+        a, observability, controllability, values = _by_few_outputs(h, window, order, width)
+    b, c = controllability[:, : h.shape[2]], observability[: h.shape[1]]
+    return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(values, observability, controllability)
+
+
+def _factors(h: Array, window: Window, order: int, full: bool) -> tuple[Array, Array, Array, Array]:
+    """A, the balanced factors, and the singular values."""
     change = hankel_operator(jnp.diff(h, axis=0), window.rows, window.columns, 1)
     operator = hankel_operator(h, window.rows, window.columns, 1, full)
     space = factor(operator, order, full)
-    a, observability, controllability = balanced(operator, change, space)
-    b, c = controllability[:, : h.shape[2]], observability[: h.shape[1]]
-    return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
+    return *balanced(operator, change, space), space.values
+
+
+def _by_few_outputs(h: Array, window: Window, order: int, width: int) -> tuple[Array, Array, Array, Array]:
+    """The same, out of few directions of the outputs where these hold all of the response."""
+    few = few_outputs(h[1:], width)
+
+    def whole() -> tuple[Array, Array, Array, Array]:
+        return _factors(h, window, order, False)
+
+    def compressed() -> tuple[Array, Array, Array, Array]:
+        small = jnp.concatenate([h[:1, :width], few.h])  # Markov parameter 0 takes no part
+        a, observability, controllability, values = _factors(small, window, order, False)
+        rows = jnp.einsum("own,mw->omn", observability.reshape(-1, width, order), few.directions)
+        rows = rows.reshape(-1, order) + _missed(few.rest, (controllability / values[:order, None]).T, window)
+        count = jax.eval_shape(whole)[3].shape[0]  # all others are zero
+        return a, rows, controllability, jnp.pad(values, (0, max(count - len(values), 0)))[:count]
+
+    return jax.lax.cond(few.exact, compressed, whole)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _missed(rest: Array, factor: Array, window: Window) -> Array:
+    """What is no more than rounding times a matrix, and so zero; but as it changes the product does."""
+    return jnp.zeros((window.shape(*rest.shape[1:])[0], factor.shape[1]), factor.dtype)
+
+
+@_missed.defjvp
+def _change_of_missed(window: Window, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    change = hankel_operator(tangents[0], window.rows, window.columns)
+    return _missed(*primals, window), change.mv(primals[1])
 
 
 @compiled

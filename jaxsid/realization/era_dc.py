@@ -193,7 +193,9 @@ def _era_dc(h, pole, steps, order, full):
     column = hankel_matrix(h, _instants(steps), (0,), 1)
     b = (space.left.T @ column) / jax.lax.stop_gradient(jnp.sqrt(space.values[:order]))[:, None]
     c = observability[: h.shape[1]]
-    return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(space, observability, controllability)
+    return *laguerre_to_shift(a, b, c, h[0], pole), named_factors(
+        space.values, observability, controllability
+    )
 
 
 @compiled
