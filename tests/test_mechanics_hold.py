@@ -87,6 +87,23 @@ def test_random_realization_has_scipys_logarithm():
     close(L, scipy.linalg.logm(A).real, 1e-12)
 
 
+@pytest.mark.parametrize("size", [5, 14])
+def test_derivative_of_the_logarithm_undoes_that_of_scipys_exponential(size):
+    rng = np.random.default_rng(6)
+    S = rng.normal(size=(size, size))
+    L = 0.1 * (S - S.T) - 0.05 * np.diag(rng.uniform(1, 2, size))
+    L[:2, :2] = [[0.0, 1.0], [0.0, 0.0]]  # a rigid body: not diagonalizable
+    L[:2, 2:] = L[2:, :2] = 0.0
+    direction = rng.normal(size=(size, size))
+    A, change = scipy.linalg.expm_frechet(L, direction)
+    found, forward = jax.jit(lambda a, da: jax.jvp(lambda x: logarithm(x)[0], (a,), (da,)))(A, change)
+    close(found, L, 1e-12)
+    close(forward, direction, 1e-10)
+    weight = rng.normal(size=(size, size))
+    reverse = jax.jit(jax.grad(lambda a: jnp.vdot(weight, logarithm(a)[0])))(A)
+    np.testing.assert_allclose(np.vdot(reverse, change), np.vdot(weight, direction), rtol=1e-10)
+
+
 def test_phi_functions_against_scipy():
     rng = np.random.default_rng(3)
     for size in (1e-8, 0.1, 5.0, 40.0):

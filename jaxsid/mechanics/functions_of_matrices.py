@@ -17,6 +17,7 @@ _DOUBLINGS = 24
 # Newton steps for each of eight square roots in a row: the first starts furthest from its goal. Enough
 # for eigenvalues with |z| > e^(-18), up to 3.13 rad from the positive real axis.
 _ROOT_STEPS = (18, 11, 9, 7, 6, 5, 5, 5)
+_LARGEST_SYSTEM = 12  # size n whose derivative of the logarithm is one system of n^2 equations
 
 
 def balance(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
@@ -102,13 +103,33 @@ def logarithm(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, 
 
     Inverse scaling and squaring: R_j = A^(1/2^j) by the product form of the Denman-Beavers iteration, then
     E_j = R_j - I through E_(j-1) = E_j (R_j + I), which loses nothing for A near I, and Gregory's series
-    log(I + E) = 2 (Z + Z^3 / 3 + ...), Z = E (2 I + E)^-1 (Higham, SIAM 2008, sections 6.3 and 11.4).
+    log(I + E) = 2 (Z + Z^3 / 3 + ...), Z = E (2 I + E)^-1 (Higham, SIAM 2008, sections 6.3 and 11.4). Small matrices
+    are differentiated once by solving for the change of the exponential, as one linear system.
 
     Args:
         A: square. There is none for an eigenvalue at zero or on the negative real axis.
     """
     d = balance(A)
-    A = A * d / d[:, None]
+    L, found = (_logarithm if len(A) <= _LARGEST_SYSTEM else _by_roots)(A * d / d[:, None])
+    return L * d[:, None] / d, found
+
+
+@jax.custom_jvp
+def _logarithm(A: Array) -> tuple[Array, Array]:
+    return _by_roots(A)
+
+
+@_logarithm.defjvp
+def _change_of_logarithm(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    L, found = _logarithm(*primals)
+    n = len(L)
+    directions = jnp.eye(n * n, dtype=L.dtype).reshape(n * n, n, n)
+    pushed = exponential_with_slopes(jnp.concatenate([L[None], directions]))[1:].reshape(n * n, n * n)
+    change = jnp.linalg.solve(pushed.T, tangents[0].ravel()).reshape(n, n)
+    return (L, found), (change, np.zeros(found.shape, jax.dtypes.float0))
+
+
+def _by_roots(A: Array) -> tuple[Array, Array]:
     eye = jnp.eye(len(A), dtype=A.dtype)
 
     def newton(carry: tuple[Array, Array], last: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -132,6 +153,4 @@ def logarithm(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, 
     series = eye / 17
     for k in range(15, 0, -2):
         series = eye / k + square @ series
-    L = 2 * 2.0 ** len(_ROOT_STEPS) * Z @ series
-    found = jnp.all(errors[ends] <= jnp.sqrt(jnp.finfo(A.dtype).eps))
-    return L * d[:, None] / d, found
+    return 2 * 2.0 ** len(_ROOT_STEPS) * Z @ series, jnp.all(errors[ends] <= jnp.sqrt(jnp.finfo(A.dtype).eps))
