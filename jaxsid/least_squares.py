@@ -79,22 +79,6 @@ def levenberg_marquardt(
         r, j = evaluate(value if through is None else through(value))
         return 0.5 * r @ r, j.T @ j, j.T @ r
 
-    def step(value: Array, product: Array, gradient: Array, damping: Array) -> tuple[Array, Array]:
-        """The candidate, and by how much the cost should fall."""
-        if through is None:
-            scale = jnp.sqrt(jnp.maximum(jnp.diag(product), tiny))
-            scaled = product / scale / scale[:, None]
-        else:
-            put, outer = through, gradient
-            product, gradient = _pulled_back(put, value, product, outer)
-            size = jnp.diag(product)
-            scale = jnp.sqrt(jnp.maximum(size, RELATIVE * size.max()))
-            scaled = (product + jax.hessian(lambda v: outer @ put(v))(value)) / scale / scale[:, None]
-            damping = jnp.maximum(damping, -1.1 * jnp.linalg.eigvalsh(scaled)[0])
-        downhill = -gradient / scale
-        d = jnp.linalg.solve(scaled + damping * jnp.eye(len(start)), downhill)
-        return value + d / scale, downhill @ d - 0.5 * d @ scaled @ d
-
     # the start is the first candidate, so that the evaluation is compiled once
     def advance(state: _State) -> _State:
         found = products(state.candidate)
@@ -112,7 +96,7 @@ def levenberg_marquardt(
         damping = jnp.where(better, jnp.maximum(eased, 1e-12), state.damping * state.growth)
         damping = jnp.where(first, state.damping, damping)
         growth = jnp.where(better, 2.0, 2 * state.growth)
-        candidate, promised = step(value, product, gradient, damping)
+        candidate, promised = _step(through, value, product, gradient, damping)
         return _State(
             value, cost, product, gradient, candidate, promised, damping, growth, state.steps + 1, finished
         )
@@ -126,6 +110,25 @@ def levenberg_marquardt(
     if through is not None:
         product, _ = _pulled_back(through, last.value, last.product, last.gradient)
     return Minimum(last.value, last.cost, product, last.steps)
+
+
+def _step(
+    through: Callable[[Array], Array] | None, value: Array, product: Array, gradient: Array, damping: Array
+) -> tuple[Array, Array]:
+    """The next candidate, and by how much the cost should fall there."""
+    if through is None:
+        scale = jnp.sqrt(jnp.maximum(jnp.diag(product), jnp.finfo(value.dtype).tiny))
+        scaled = product / scale / scale[:, None]
+    else:
+        outer = gradient
+        product, gradient = _pulled_back(through, value, product, outer)
+        size = jnp.diag(product)
+        scale = jnp.sqrt(jnp.maximum(size, RELATIVE * size.max()))
+        scaled = (product + jax.hessian(lambda v: outer @ through(v))(value)) / scale / scale[:, None]
+        damping = jnp.maximum(damping, -1.1 * jnp.linalg.eigvalsh(scaled)[0])
+    downhill = -gradient / scale
+    d = jnp.linalg.solve(scaled + damping * jnp.eye(len(value)), downhill)
+    return value + d / scale, downhill @ d - 0.5 * d @ scaled @ d
 
 
 def _pulled_back(
