@@ -131,22 +131,27 @@ def _response_rows(
     right = jnp.linalg.pinv(realization.controllability).reshape(-1, inputs, len(A))
     rows, columns = realization.row_steps, realization.column_steps
     length = fast_length(samples)
-    left_f = jnp.fft.rfft(_in_time(left, rows, length), axis=0)
-    right_f = jnp.fft.rfft(_in_time(right, columns, length), axis=0)
-    later = jnp.exp(-2j * jnp.pi * jnp.arange(len(left_f)) / length)[:, None, None]
+    left_f, right_f = (
+        jnp.fft.rfft(_in_time(x, steps, length)) for x, steps in ((left, rows), (right, columns))
+    )
+    later = jnp.exp(-2j * jnp.pi * jnp.arange(left_f.shape[-1]) / length)
     # of L dH0 R, and of the same one sample later
     here = -jnp.einsum("ji,pjk->pik", A, to_a) - jnp.einsum("oi,pok->pik", C, to_c)
-    both = here[:, None] + to_a[:, None] * later
-    product = jnp.einsum("foa,pfab,fcb->pfoc", left_f, both, right_f)
-    first_row = jnp.einsum("pob,fcb->pfoc", to_c, right_f)
-    first_column = jnp.einsum("foa,pac->pfoc", left_f, to_b)
-    total = jnp.fft.irfft((product + first_row + first_column) * later, length, axis=1)[:, :samples]
-    return total.at[:, 0].add(to_d)
+
+    def onto(x: Array) -> Array:
+        """Real matrices times real and imaginary parts by turns: products without complex arithmetic."""
+        return jax.lax.complex(*(jnp.einsum("pab,cbf->pacf", x, y) for y in (right_f.real, right_f.imag)))
+
+    inner = onto(here) + onto(to_a) * later + to_b[..., None]
+    product = (left_f[:, :, None] * inner[:, None]).sum(axis=2) + onto(to_c)
+    total = jnp.fft.irfft(product * later, length)[..., :samples]
+    return jnp.moveaxis(total, -1, 1).at[:, 0].add(to_d)
 
 
-def _in_time(blocks: Array, steps: Steps, length: int) -> Array:
-    """Blocks put at their time indices, zero between."""
-    return jnp.zeros((length, *blocks.shape[1:]), blocks.dtype).at[jnp.array(steps)].set(blocks)
+def _in_time(blocks: Array, steps: Steps, length: int) -> Float[Array, "channels n length"]:
+    """Blocks put at their time indices, zero between; time last."""
+    spread = jnp.zeros((*blocks.shape[1:], length), blocks.dtype)
+    return spread.at[..., jnp.array(steps)].set(jnp.moveaxis(blocks, 0, -1))
 
 
 def _real_row(value: Any) -> Array:
