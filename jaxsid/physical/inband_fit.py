@@ -26,9 +26,8 @@ from jaxsid.physical.parameterization import Parameterization, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
 STEPS = 200
-STILL = (
-    1e-4  # an unknown that moves M, D, K less than this, next to the one that moves them most, is at an edge
-)
+# An unknown that moves M, D, K less than this, next to the one that moves them most, is at an edge.
+STILL = 1e-4
 
 
 class Target(NamedTuple):
@@ -119,7 +118,6 @@ def fit_matrices(
         start: M, D, K to begin with.
         sensed: gives the input matrix and the sensors; its matrices are not used.
     """
-
     size = len(sensed.mass)
 
     def entries(theta: Array) -> Array:
@@ -211,9 +209,8 @@ def _motion(target: Target, matrices: Triple) -> tuple[Array, Array]:
     rate = jnp.sqrt(jnp.trace(K) / jnp.trace(M))
     units = jnp.where(jnp.arange(2 * size) < size, 1.0, jnp.where(rate > 0, rate, 1.0))
     levelled = stack * units / units[:, None]
-    held = jax.lax.map(lambda dt: exponential_with_slopes(levelled * dt), target.dt) / (
-        units / units[:, None]
-    )
+    held = jax.lax.map(lambda dt: exponential_with_slopes(levelled * dt), target.dt)
+    held = held * units[:, None] / units
     # for dt = 0 the transients are those of continuous time
     every = jnp.where(target.dt[:, None, None, None] > 0, held, stack)
     return every[:, 0], jnp.moveaxis(every[:, 1:], 1, -1)

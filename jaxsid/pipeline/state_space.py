@@ -154,9 +154,8 @@ def _reason(raw: Realization, order: int | None, expected: int) -> str:
     values = np.asarray(raw.singular_values)
     if order is not None:
         return f"Order {order} was asked for; bodies and sensors of the model have {expected} visible states."
-    drops = values[:-1] / np.maximum(
-        values[1:], np.finfo(values.dtype).eps * values[0]
-    )  # below it is rounding
+    rounding = np.finfo(values.dtype).eps * values[0]
+    drops = values[:-1] / np.maximum(values[1:], rounding)
     steepest = int(np.argmax(drops[1:])) + 2
     compared = "more than after any other" if steepest == expected else (
         f"{drops[steepest - 1]:.3g} times after {steepest}"
