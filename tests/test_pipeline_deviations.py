@@ -67,7 +67,7 @@ def pulls(seed, colour):
         [getattr(found.matrices, n) for n in ("mass", "damping", "stiffness")], truth
     )
     values += parts(own[upper] - truth, np.asarray(found.pole_std)[upper])
-    free = np.abs(shapes) < 1  # the largest is 1 by definition
+    free = np.abs(shapes) < 1 - 1e-9  # the largest is 1 by definition
     values += parts((found_shapes - shapes)[free], np.asarray(found.shape_std)[:, upper][free])
     values.append((np.abs(own[upper]) - np.abs(truth)) / np.asarray(found.frequency_std)[upper])
     ratio = -own[upper].real / np.abs(own[upper]) + truth.real / np.abs(truth)
