@@ -83,7 +83,7 @@ def parts(error, spread):
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", [None, "low"])
 def test_intervals_hold_as_often_as_they_say(colour):
-    """Of 200 records; the share of one number is known to 1.5 %, and 4.5 deviations are allowed of 45 numbers."""
+    """Pooled near 95 %, each number 92 % or more, which 200 records tell to 1.9 %: three of these are allowed."""
     inside = np.abs([pulls(seed, colour) for seed in range(200)]) < 1.96
     assert 0.93 < inside.mean() < 0.965
-    assert inside.mean(axis=0).min() > 0.95 - 4.5 * 0.0154
+    assert inside.mean(axis=0).min() > 0.92 - 3 * 0.019
