@@ -83,7 +83,8 @@ def parts(error, spread):
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", [None, "low"])
 def test_intervals_hold_as_often_as_they_say(colour):
-    """Pooled near 95 %, each number 92 % or more, which 200 records tell to 1.9 %: three of these are allowed."""
-    inside = np.abs([pulls(seed, colour) for seed in range(200)]) < 1.96
-    assert 0.93 < inside.mean() < 0.965
-    assert inside.mean(axis=0).min() > 0.92 - 3 * 0.019
+    """Over 1000 records: 94 to 96 % pooled, 92 to 98 % for each number."""
+    inside = np.abs([pulls(seed, colour) for seed in range(1000)]) < 1.96
+    assert 0.94 < inside.mean() < 0.96
+    assert inside.mean(axis=0).min() > 0.92
+    assert inside.mean(axis=0).max() < 0.98
