@@ -139,10 +139,16 @@ def _not_this_order(system: Setting) -> Found:
 
 def _deviation(found: Found) -> MatrixDeviation:
     assert found.fit is not None
-    fit, rows = found.fit, [np.asarray(x).sum(axis=1) for x in found.fit.slopes[1:]]
+    fit, rows = found.fit, [_row_sums(np.asarray(x)) for x in found.fit.slopes[1:]]
     covariance = np.asarray(fit.covariance)
     sums = [np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", x, covariance, x), 0.0)) for x in rows]
     return MatrixDeviation(*fit.deviation, *(as_array(x) for x in sums))
+
+
+def _row_sums(slopes: np.ndarray) -> np.ndarray:
+    """Slopes (N, N, p) of every row's sum; terms that cancel, as where nothing joins a body to ground, leave zero."""
+    total, size = slopes.sum(axis=1), np.abs(slopes).sum(axis=1)
+    return np.where(np.abs(total) > 8 * np.finfo(slopes.dtype).eps * size, total, 0.0)
 
 
 def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedModel:
