@@ -48,6 +48,14 @@ class Algorithm(StrEnum):
     era_dc = "era_dc"
 
 
+class Structure(StrEnum):
+    """Whose mass, damping and stiffness."""
+
+    auto = "auto"
+    free = "free"
+    model = "model"
+
+
 class Initial(StrEnum):
     """Initial state of a record."""
 
@@ -80,6 +88,13 @@ def identify(
     ] = Method.inband,
     realization: Annotated[Algorithm, typer.Option(help="Realization algorithm.")] = Algorithm.era,
     initial: Annotated[Initial, typer.Option(help="Initial state of each record.")] = Initial.estimate,
+    structure: Annotated[
+        Structure,
+        typer.Option(
+            help="Mass, damping and stiffness: free symmetric, made of the model's elements, or these unless the "
+            "records contradict them."
+        ),
+    ] = Structure.auto,
     quiet: Quiet = False,
 ) -> None:
     """Impulse response, ERA or ERA/DC, modes, mass, damping and stiffness from records."""
@@ -100,6 +115,7 @@ def identify(
             method=_method(method, measured, say),
             realization=realization.value,
             initial=initial.value,
+            structure=structure.value,
             progress=say,
         )
         _write(found, out, say)

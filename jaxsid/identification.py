@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.elements import ElementValues
 from jaxsid.realization.stabilization import Stabilization
 from jaxsid.records import ContinuousModel, ImpulseResponse, ModalModel, Realization, Record, SecondOrderModel
 
@@ -62,6 +63,7 @@ class Identification(eqx.Module):
         cbsi: mass, damping and stiffness by CBSI alone; None where impossible.
         matrices: mass, damping and stiffness, symmetric, that fit the records best; None where impossible.
         matrices_std: their standard deviations.
+        elements: values of the model's own elements, where their matrices fit the records as well as any; else None.
         identified: `matrices` as a model file; None where impossible.
         predictions: response of the identified model to each record's inputs, initial state estimated.
         train_nrmse, noise_floor: (outputs,) rms(y - yhat) / std(y), and what pure noise would leave.
@@ -87,6 +89,7 @@ class Identification(eqx.Module):
     cbsi: SecondOrderModel | None
     matrices: SecondOrderModel | None
     matrices_std: MatrixDeviation | None
+    elements: ElementValues | None
     identified: LumpedModel | None
     predictions: tuple[Float[Array, "_ outputs"], ...]
     train_nrmse: Float[Array, " outputs"]

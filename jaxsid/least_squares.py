@@ -18,12 +18,15 @@ class Minimum(NamedTuple):
         cost: half the sum of squares.
         jacobian_product: (n, n) J'J there; its inverse is the covariance where the residual has unit variance.
         steps: evaluations used.
+        seen_product, seen_gradient: J'J and J'r for what `evaluate` sees, (m, m) and (m,).
     """
 
     value: Float[Array, " n"]
     cost: Float[Array, ""]
     jacobian_product: Float[Array, "n n"]
     steps: Array
+    seen_product: Float[Array, "m m"]
+    seen_gradient: Float[Array, " m"]
 
 
 class _State(NamedTuple):
@@ -109,7 +112,7 @@ def levenberg_marquardt(
     product = last.product
     if through is not None:
         product, _ = _pulled_back(through, last.value, last.product, last.gradient)
-    return Minimum(last.value, last.cost, product, last.steps)
+    return Minimum(last.value, last.cost, product, last.steps, last.product, last.gradient)
 
 
 def _step(

@@ -31,7 +31,8 @@ def test_slopes_of_poles_and_shapes_are_those_of_differences():
     both = SymmetricMatrices((np.ones((3, 3)), np.ones((3, 3)), np.full((3, 3), 1e3)), (np.eye(3),) * 3)
     theta = both.unknowns(tuple(map(jnp.asarray, TRUTH)))
     slopes = jax.jacfwd(both.matrices)(theta)
-    fit = MatrixFit(both.matrices(theta), slopes, jnp.ones(()), jnp.eye(len(theta)), slopes)  # type: ignore[arg-type]
+    parts = {name: jnp.zeros(()) for name in MatrixFit._fields}
+    fit = MatrixFit(**parts)._replace(matrices=both.matrices(theta), slopes=slopes)  # type: ignore[arg-type]
     poles, _ = eigenpairs(TRUTH, np.array([-1 + 25j, -1 + 60j, -1 + 90j]))
     of_poles = _slopes_of_matrices(fit, poles)
     of_shapes = _slopes_of_shapes(fit, np.eye(3), poles, of_poles)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
@@ -28,6 +28,7 @@ from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 STEPS = 200
 # An unknown that moves M, D, K less than this, next to the one that moves them most, is at an edge.
 STILL = 1e-4
+BLIND = 1e-10  # of the largest eigenvalue of scaled J'J: a combination that leaves no trace
 
 
 class Target(NamedTuple):
@@ -59,6 +60,11 @@ class MatrixFit(NamedTuple):
         matrices: M, D, K.
         deviation: standard deviation of every entry.
         misfit: mean square of the weighted residual; 1 when the model explains all but noise.
+        squares: sum of the squares of the weighted residual.
+        excess: by how much `squares` would fall were every entry of symmetric M, D, K free, to first order.
+        reach: number of combinations of these entries that the lines tell of.
+        unknowns: (p,) those of the parameterization.
+        information: J'J of the weighted residual to the unknowns.
         covariance: of the unknowns, times the misfit where that is above 1.
         slopes: derivative of every entry of M, D, K to the unknowns, (N, N, p) each.
     """
@@ -66,6 +72,11 @@ class MatrixFit(NamedTuple):
     matrices: Triple
     deviation: Triple
     misfit: Float[Array, ""]
+    squares: Float[Array, ""]
+    excess: Float[Array, ""]
+    reach: Int[Array, ""]
+    unknowns: Float[Array, " p"]
+    information: Float[Array, "p p"]
     covariance: Float[Array, "p p"]
     slopes: tuple[Float[Array, "N N p"], Float[Array, "N N p"], Float[Array, "N N p"]]
 
@@ -124,9 +135,7 @@ def fit_matrices(
         return jnp.concatenate([x[np.triu_indices(size)] for x in parameterization.matrices(theta)])
 
     def evaluate(upper: Array) -> tuple[Array, Array]:
-        matrices = _symmetric(upper, size)
-        model, slopes = _lines_and_slopes(target, matrices, sensed)
-        return _without_transients(target, target.y - model, -slopes, *_motion(target, matrices), sensed)
+        return line_residual(target, _symmetric(upper, size), sensed)
 
     theta = parameterization.unknowns(start)
     found = levenberg_marquardt(evaluate, theta, max_steps=STEPS, through=entries)
@@ -141,8 +150,41 @@ def fit_matrices(
         jnp.sqrt(jnp.maximum(jnp.einsum("ijp,pq,ijq->ij", x, covariance, x), 0.0)) for x in slopes
     )
     return MatrixFit(
-        parameterization.matrices(found.value), (d_mass, d_damping, d_stiffness), misfit, covariance, slopes
+        parameterization.matrices(found.value),
+        (d_mass, d_damping, d_stiffness),
+        misfit,
+        2 * found.cost,
+        *_score(found.seen_product, found.seen_gradient),
+        found.value,
+        found.jacobian_product,
+        covariance,
+        slopes,
     )
+
+
+def line_residual(target: Target, matrices: Triple, sensed: SecondOrderModel) -> tuple[Array, Array]:
+    """Weighted residual (equations,) and its Jacobian to the upper triangles of M, D, K, transients projected out.
+
+    Args:
+        target: the lines.
+        matrices: M, D, K.
+        sensed: gives the input matrix and the sensors.
+    """
+    model, slopes = _lines_and_slopes(target, matrices, sensed)
+    return _without_transients(target, target.y - model, -slopes, *_motion(target, matrices), sensed)
+
+
+def _score(product: Array, gradient: Array) -> tuple[Array, Array]:
+    """g' (J'J)^-1 g, the score statistic, and the rank of J'J.
+
+    Source: C. R. Rao, Proc. Cambridge Phil. Soc. 44 (1948).
+    """
+    scale = jnp.sqrt(jnp.diag(product))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    values, vectors = jnp.linalg.eigh(product / scale / scale[:, None])
+    told = values > BLIND * values[-1]
+    along = vectors.T @ (gradient / scale)
+    return jnp.where(told, along**2 / jnp.where(told, values, 1.0), 0.0).sum(), told.sum()
 
 
 def _covariance(product: Array, before: tuple[Array, ...], slopes: tuple[Array, ...]) -> Array:

@@ -10,6 +10,7 @@ from jaxsid.impulse.lines import Lines, record_lines
 from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.mechanics.lumped import LumpedModel, Matrices, lumped_model
 from jaxsid.mechanics.simulate import markov_parameters
+from jaxsid.physical.elements import ElementValues, with_values
 from jaxsid.pipeline.fit import frequency_fits, no_time_fit, time_fit
 from jaxsid.pipeline.matrices import POOR, Found, find_matrices
 from jaxsid.pipeline.modes import FinalModes, final_modes
@@ -18,6 +19,7 @@ from jaxsid.pipeline.state_space import StateSpace, state_space
 from jaxsid.records import Record, SecondOrderModel, as_array
 
 LONGEST_RESPONSE = 8192  # samples of the impulse response that is reported
+STRUCTURES = ("auto", "free", "model")
 Progress = Callable[[str], None]
 
 
@@ -30,6 +32,7 @@ def identify(
     method: ImpulseMethod | None = None,
     realization: str = "era",
     initial: str = "estimate",
+    structure: str = "auto",
     progress: Progress | None = None,
 ) -> Identification:
     """Impulse response, state-space model, modes and M, D, K of a system, from records of its inputs and outputs.
@@ -47,6 +50,8 @@ def identify(
         method: estimator of the impulse response, such as `InBand()` (the default) or `Wavelet()`.
         realization: "era" or "era_dc".
         initial: "estimate" each record's initial state, or take it to be at "rest", for the comparison in time.
+        structure: "free" for symmetric mass, damping and stiffness; "model" for those that the model's elements can
+            make; "auto" for the latter unless the records contradict them (chi-squared test at 1 %).
         progress: called with a line of text as each stage begins.
 
     Returns:
@@ -61,6 +66,7 @@ def identify(
     say = progress or (lambda text: None)
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose estimate or rest.")
+    require(structure in STRUCTURES, f"structure '{structure}' is unknown; choose {' or '.join(STRUCTURES)}.")
     system = setting(model, records)
     _check_records(model, records, order or system.visible)
     say("impulse response in the excited band")
@@ -72,7 +78,11 @@ def identify(
     if len(space.raw.A) != system.visible:
         found = _not_this_order(system)
     else:
-        found = find_matrices(model, system, space) if space.stable else Found(None, None, None, ())
+        found = (
+            find_matrices(model, system, space, structure)
+            if space.stable
+            else Found(None, None, None, None, ())
+        )
     explained = found.fit is not None and float(found.fit.misfit) < POOR
     say("modes, fit")
     final = final_modes(space, found.model if explained else None, found.fit if explained else None)
@@ -114,7 +124,8 @@ def _collect(
         cbsi=found.cbsi,
         matrices=found.model,
         matrices_std=None if found.fit is None else _deviation(found),
-        identified=None if found.model is None else identified_model(model, found.model),
+        elements=found.elements,
+        identified=None if found.model is None else identified_model(model, found.model, found.elements),
         predictions=times.predictions,
         train_nrmse=as_array(times.nrmse),
         noise_floor=as_array(times.floor),
@@ -131,7 +142,7 @@ def _collect(
 
 
 def _not_this_order(system: Setting) -> Found:
-    return Found(None, None, None, (
+    return Found(None, None, None, None, (
         f"The bodies and sensors of the model have {system.visible} visible states: with another order there is no "
         "mass, damping and stiffness.",
     ))  # fmt: skip
@@ -151,13 +162,18 @@ def _row_sums(slopes: np.ndarray) -> np.ndarray:
     return np.where(np.abs(total) > 8 * np.finfo(slopes.dtype).eps * size, total, 0.0)
 
 
-def identified_model(nominal: LumpedModel, found: SecondOrderModel) -> LumpedModel:
-    """The nominal model with its numbers replaced by identified matrices.
+def identified_model(
+    nominal: LumpedModel, found: SecondOrderModel, elements: ElementValues | None = None
+) -> LumpedModel:
+    """The nominal model with its numbers replaced by identified ones: of its elements, or else matrices.
 
     Args:
         nominal: gives bodies, inputs and sensors.
         found: M, D, K.
+        elements: values of the model's elements; None for matrices.
     """
+    if elements is not None:
+        return with_values(nominal, np.asarray(elements.values))
     symmetric = [np.asarray(x) for x in (found.mass, found.damping, found.stiffness)]
     mass, damping, stiffness = (0.5 * (x + x.T) for x in symmetric)
     return lumped_model(

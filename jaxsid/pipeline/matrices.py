@@ -8,10 +8,20 @@ from jaxtyping import Array
 from jaxsid.checks import JaxsidError
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.physical.cbsi import cbsi
-from jaxsid.physical.inband_fit import MatrixFit, fit_matrices, fit_target
+from jaxsid.physical.elements import ElementValues
+from jaxsid.physical.inband_fit import MatrixFit, Target, fit_matrices, fit_target
 from jaxsid.physical.parameterization import PositiveMatrices, SymmetricMatrices, Triple, entry_sizes
 from jaxsid.pipeline.setting import Setting
 from jaxsid.pipeline.state_space import StateSpace
+from jaxsid.pipeline.structure import (
+    ElementFit,
+    as_good,
+    element_values,
+    fit_elements,
+    uncontradicted,
+    undetermined,
+    widened_start,
+)
 from jaxsid.records import SecondOrderModel, as_array
 
 GOOD = 1.5  # mean square residual, in units of the noise, that leaves nothing to look for
@@ -24,40 +34,124 @@ POOR = 3.0  # one that the user must hear of
 
 
 class Found(NamedTuple):
-    """Mass, damping and stiffness by CBSI and by the fit, None where impossible, and why."""
+    """Matrices by CBSI and by the fit, values of the model's elements if these fit, None where impossible, and why."""
 
     cbsi: SecondOrderModel | None
     fit: MatrixFit | None
     model: SecondOrderModel | None
+    elements: ElementValues | None
     warnings: tuple[str, ...]
 
 
-def find_matrices(model: LumpedModel, system: Setting, space: StateSpace) -> Found:
-    """Mass, damping and stiffness, where every body has a sensor.
+def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, structure: str) -> Found:
+    """Mass, damping and stiffness: free symmetric matrices, or the values of the model's elements.
 
     Args:
         model: nominal; where CBSI fails its numbers are one place to start from.
         system: sensors and places.
         space: the state-space model.
+        structure: "free" for symmetric matrices, "model" for its elements, "auto" for these if they fit as well.
     """
     sensed = _sensed(model, system)
+    target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     if system.one_a_body is None:
-        return Found(None, None, None, (_too_few(model, system),))
+        return _by_elements_alone(model, system, space, target, sensed, structure)
     structured, trouble = _cbsi(system, space)
-    fit, held = _best_fit(model, system, space, sensed, structured)
-    notes = (*trouble, *_notes(fit, structured), *((AT_THE_EDGE,) if held else ()))
+    elements, free = _elements_and_free(model, system, space, target, sensed, structured, structure)
+    if elements is not None:
+        notes = (*trouble, *_notes(elements.fit, structured))
+        return _found(sensed, structured, elements.fit, element_values(elements), notes)
+    contradicted = () if structure == "free" or free is None else (_contradicted(free),)
+    fit, held = _positive_fit(system, space, target, sensed, free)
+    notes = (*trouble, *_notes(fit, structured), *contradicted, *((AT_THE_EDGE,) if held else ()))
+    return _found(sensed, structured, fit, None, notes)
+
+
+def _elements_and_free(
+    model: LumpedModel,
+    system: Setting,
+    space: StateSpace,
+    target: Target,
+    sensed: SecondOrderModel,
+    structured: SecondOrderModel | None,
+    structure: str,
+) -> tuple[ElementFit | None, MatrixFit | None]:
+    """The fit of the elements, unless the lines contradict it, and that of free matrices where it was needed."""
+    nominal: Triple = (sensed.mass, sensed.damping, sensed.stiffness)
+    if structure != "free":
+        start = nominal if structured is None else (structured.mass, structured.damping, structured.stiffness)
+        elements = _if_positive(fit_elements(model, target, start, sensed))
+        if elements is not None and float(elements.fit.misfit) < GOOD and uncontradicted(elements.fit):
+            return elements, None
+    free = _free_fit(system, space, target, sensed, structured)
+    if structure == "free":
+        return None, free
+    start = nominal if free is None else free.matrices
+    elements = _if_positive(fit_elements(model, target, start, sensed))
+    wanted = structure == "model" or free is None or (elements is not None and as_good(elements.fit, free))
+    return (elements if wanted else None), free
+
+
+def _if_positive(elements: ElementFit | None) -> ElementFit | None:
+    return elements if elements is not None and _positive(elements.fit.matrices) else None
+
+
+def _found(
+    sensed: SecondOrderModel,
+    structured: SecondOrderModel | None,
+    fit: MatrixFit | None,
+    elements: ElementValues | None,
+    notes: tuple[str, ...],
+) -> Found:
     if fit is None:
-        return Found(structured, None, None, notes)
-    matrices = dict(zip(("mass", "damping", "stiffness"), fit.matrices, strict=True))
+        return Found(structured, None, None, None, notes)
+    mass, damping, stiffness = fit.matrices
     found = SecondOrderModel(
-        **matrices,
-        input_matrix=sensed.input_matrix,
-        displacement_sensors=sensed.displacement_sensors,
-        velocity_sensors=sensed.velocity_sensors,
-        acceleration_sensors=sensed.acceleration_sensors,
+        mass,
+        damping,
+        stiffness,
+        sensed.input_matrix,
+        sensed.displacement_sensors,
+        sensed.velocity_sensors,
+        sensed.acceleration_sensors,
         diagnostics=None if structured is None else structured.diagnostics,
     )
-    return Found(structured, fit, found, notes)
+    return Found(structured, fit, found, elements, notes)
+
+
+def _by_elements_alone(
+    model: LumpedModel,
+    system: Setting,
+    space: StateSpace,
+    target: Target,
+    sensed: SecondOrderModel,
+    structure: str,
+) -> Found:
+    """Where bodies have no sensor only the model's structure can tell their part."""
+    nothing = Found(None, None, None, None, (_too_few(model, system),))
+    if structure == "free":
+        return nothing
+    highest = 2 * np.pi * float(np.asarray(space.lines.band)[1])
+    start = widened_start(model, space, sensed, highest)
+    elements = fit_elements(model, target, start, sensed)
+    if elements is None or not _positive(elements.fit.matrices) or float(elements.fit.misfit) > POOR:
+        return nothing
+    if (blind := undetermined(elements)).any():
+        names = ", ".join(x.name for x, lost in zip(elements.unknowns.listed, blind, strict=True) if lost)
+        return nothing._replace(
+            warnings=(*nothing.warnings, f"Not even with the model's structure: {names}.")
+        )
+    bare = ", ".join(b for i, b in enumerate(model.bodies) if i not in system.places)
+    note = f"No sensor on {bare}: mass, damping and stiffness there follow from the model's structure."
+    return _found(sensed, None, elements.fit, element_values(elements), (note, *_notes(elements.fit, None)))
+
+
+def _contradicted(free: MatrixFit) -> str:
+    return (
+        "The records contradict the structure of the model: no values of its own elements fit them as well as free "
+        f"symmetric matrices do (misfit {float(free.misfit):.3g}). These are given; their entries that the model does "
+        "not have tell what it lacks."
+    )
 
 
 def _too_few(model: LumpedModel, system: Setting) -> str:
@@ -109,21 +203,15 @@ def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, 
     return found, ()
 
 
-def _best_fit(
-    model: LumpedModel,
+def _free_fit(
     system: Setting,
     space: StateSpace,
+    target: Target,
     sensed: SecondOrderModel,
     structured: SecondOrderModel | None,
-) -> tuple[MatrixFit | None, bool]:
-    """The fit with the smallest misfit over the starts, tried in turn until one is good; whether the edge held it.
-
-    From there it goes on among positive matrices where it left them.
-    """
-    target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
-    every, moving, strained = np.eye(len(model.bodies)), _complement(system.loose), _complement(system.rigid)
-    complements = every, moving, strained
-    best = None
+) -> MatrixFit | None:
+    """The fit of symmetric matrices with the smallest misfit over the starts, tried in turn until one is good."""
+    complements, best = _complements(system), None
     for start in _starts(space, sensed, structured):
         parameters = SymmetricMatrices(entry_sizes(start, complements, _rate(space)), complements)
         fit = fit_matrices(target, parameters, start, sensed)
@@ -131,15 +219,27 @@ def _best_fit(
             best = fit
         if best is not None and float(best.misfit) < GOOD:
             break
-    if best is None or _positive(best.matrices):
-        return best, False
-    mass, damping, stiffness = (np.asarray(x) for x in best.matrices)
+    return best
+
+
+def _positive_fit(
+    system: Setting, space: StateSpace, target: Target, sensed: SecondOrderModel, free: MatrixFit | None
+) -> tuple[MatrixFit | None, bool]:
+    """The free fit if its matrices are positive, else the best positive one near it; whether the edge held it."""
+    if free is None or _positive(free.matrices):
+        return free, False
+    mass, damping, stiffness = (np.asarray(x) for x in free.matrices)
+    complements = _complements(system)
     sizes = entry_sizes((mass, damping, stiffness), complements, _rate(space))
-    parameters = PositiveMatrices(sizes, complements)
-    best = fit_matrices(target, parameters, best.matrices, sensed)
+    best = fit_matrices(target, PositiveMatrices(sizes, complements), free.matrices, sensed)
     if not (np.isfinite(best.misfit) and _positive(best.matrices)):
         return None, False
     return best, float(best.misfit) > GOOD  # below that noise explains it
+
+
+def _complements(system: Setting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates that M, D and K act on."""
+    return np.eye(len(system.rigid)), _complement(system.loose), _complement(system.rigid)
 
 
 def _complement(patterns: np.ndarray) -> np.ndarray:

@@ -4,16 +4,23 @@ import numpy as np
 
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
+from jaxsid.physical.elements import ElementValues
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
 from jaxsid.report.modes import Mode, connecting, modes_of, worst_fits
 from jaxsid.report.numbers import MISSING, TIMES, change, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
-from jaxsid.report.units import units_of
+from jaxsid.report.units import Units, units_of
 
 NO_MATRICES = (
     "These records do not determine the matrices. One driving point (a force and a sensor on the same "
     "body) and as many modes as bodies are needed; the warnings say what is missing. The modes above "
     "hold all the same."
+)
+FREE = "Symmetric matrices that fit the records best, in the order of the bodies."
+BY_ELEMENTS = (
+    "Made of the model's own masses, springs and dampers, whose values were fitted to the records. Free symmetric "
+    "matrices would fit no better than chance allows (chi-squared test at 1 %), so that entries which the model does "
+    "not have are zero."
 )
 TABLED = 8  # larger matrices are shown as figures
 GOOD_FIT, POOR_FIT = 1.2, 3.0  # misfit over noise floor
@@ -122,7 +129,7 @@ def matrices_section(found: Identification) -> Section:
     """Mass, damping and stiffness with deviations, or why there are none."""
     if found.matrices is None:
         return Section("Mass, damping, stiffness", (Text(NO_MATRICES),))
-    blocks: list[Block] = [Text("Symmetric matrices that fit the records best, in the order of the bodies.")]
+    blocks: list[Block] = [Text(FREE if found.elements is None else BY_ELEMENTS)]
     if len(found.matrices.mass) <= TABLED:
         blocks.append(Tables(tuple(_matrix(found, which) for which in MATRICES)))
     elements = _elements(found)
@@ -160,7 +167,9 @@ def _beside(value: float, nominal: float) -> str:
 
 
 def _elements(found: Identification) -> Table | None:
-    """Bodies and connections one by one, read off the matrices, where the nominal model is made of them."""
+    """Bodies and connections one by one: as fitted, or else read off the matrices of a model made of them."""
+    if found.elements is not None:
+        return elements_table(found.elements, units_of(found.nominal))
     model = found.nominal
     if found.matrices is None or model.matrices is not None:
         return None
@@ -175,14 +184,41 @@ def _elements(found: Identification) -> Table | None:
     )
     rows = [(name, *_beside_nominal(*(float(x) for x in row)), "", "") for name, *row in bodies]
     rows += [_connection(found, i) for i in range(len(model.connections))]
-    header = ("Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal")
-    title = f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
     note = (
         "Read off the matrices: a connection between two bodies is their entry off the diagonal with "
         "the sign changed, one to ground the sum of a row. Below each nominal value: the change from "
         "it."
     )
-    return Table(header, tuple(rows), title, note)
+    return Table(_element_header(units), tuple(rows), _element_title(units), note)
+
+
+def _element_header(units: Units) -> tuple[str, ...]:
+    return "Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal"
+
+
+def _element_title(units: Units) -> str:
+    return f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
+
+
+def elements_table(elements: ElementValues, units: Units) -> Table:
+    """Fitted values of bodies and connections with standard deviations, beside the nominal ones.
+
+    Args:
+        elements: the values.
+        units: of the model.
+    """
+    cells = {
+        (unknown.element, unknown.quantity): _beside_nominal(float(value), float(std), float(nominal))
+        for unknown, value, std, nominal in zip(
+            elements.listed, elements.values, elements.deviation, elements.nominal, strict=True
+        )
+    }
+    nothing = ("", "")
+    bodies = [(e, *cells[e, q], *nothing) for e, q in cells if q == "mass"]
+    joints = dict.fromkeys(e for e, q in cells if q != "mass")
+    rows = [(e, *cells.get((e, "stiffness"), nothing), *cells.get((e, "damping"), nothing)) for e in joints]
+    note = "± one standard deviation. Below each nominal value: the change from it."
+    return Table(_element_header(units), (*bodies, *rows), _element_title(units), note)
 
 
 def _connection(found: Identification, i: int) -> tuple[str | Cell, ...]:

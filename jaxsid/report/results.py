@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxsid.files.results_json import SCHEMA, plain
 from jaxsid.identification import Identification
+from jaxsid.physical.elements import ElementValues
 from jaxsid.records import SecondOrderModel
 from jaxsid.report.modes import displacement_shapes, modes_of
 from jaxsid.report.units import sensor_kinds
@@ -28,6 +29,7 @@ def identification_json(found: Identification) -> dict[str, Any]:
         "poles": np.asarray(found.modal.poles),
         **_matrices(found.matrices),
         "std": None if found.matrices_std is None else _matrices(found.matrices_std),
+        "elements": None if found.elements is None else elements_json(found.elements),
         "fit": {
             "train_nrmse": _by_name(found.outputs, found.train_nrmse),
             "noise_floor": _by_name(found.outputs, found.noise_floor),
@@ -67,6 +69,20 @@ def _modes(found: Identification) -> list[dict[str, Any]]:
 
 def _matrices(holder: Any) -> dict[str, Any]:
     return {name: None if holder is None else np.asarray(getattr(holder, name)) for name in MATRICES}
+
+
+def elements_json(elements: ElementValues) -> list[dict[str, Any]]:
+    """One record for each value; a standard deviation of null is unknown, that is infinite.
+
+    Args:
+        elements: values of a model's elements.
+    """
+    columns = elements.values, elements.deviation, elements.nominal
+    return [
+        {"name": x.name, "element": x.element, "quantity": x.quantity}
+        | {"value": float(value), "std": float(std), "nominal": float(nominal)}
+        for x, value, std, nominal in zip(elements.listed, *columns, strict=True)
+    ]
 
 
 def _by_name(names: tuple[str, ...], values: Any) -> dict[str, float]:

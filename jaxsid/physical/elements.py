@@ -1,0 +1,208 @@
+"""Unknowns in proportion to which mass, damping and stiffness change: masses, springs and dampers of a model."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.mechanics.lumped import GROUND, LumpedModel, Matrices, incidence, lumped_model
+from jaxsid.physical.parameterization import Matrix, Triple
+from jaxsid.records import as_array
+
+QUANTITIES = ("mass", "damping", "stiffness")
+ROUNDING = 1e-9  # sum of a row, next to its entries, that is none
+
+
+class Element(NamedTuple):
+    """One number of a lumped model, such as the "stiffness" of "gearbox"; for matrices, of "b1, b2" or "ground, b1"."""
+
+    element: str
+    quantity: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.element}.{self.quantity}"
+
+
+class ElementValues(eqx.Module):
+    """Numbers of a lumped model, as identified.
+
+    Attributes:
+        listed: which ones.
+        values: (p,) SI units.
+        deviation: (p,) standard deviations; infinite where the records do not tell, 0 where a bound held the value.
+        correlation: (p, p) of their errors; NaN where there is no deviation.
+        nominal: (p,) of the model that the user gave.
+    """
+
+    listed: tuple[Element, ...] = eqx.field(static=True)
+    values: Float[Array, " p"]
+    deviation: Float[Array, " p"]
+    correlation: Float[Array, "p p"]
+    nominal: Float[Array, " p"]
+
+
+class LinearMatrices(eqx.Module):
+    """M, D and K as sums of the values of elements times fixed symmetric matrices.
+
+    The values follow from fewer unknowns: values = base + mix (theta * scale), so that some may be held, others tied.
+
+    Attributes:
+        directions: (e, N, N) of M, of D and of K: what one unit of each value adds.
+        inverse: (e, 3 N N) values of least squares from the entries of M, D, K.
+        base: (e,) what does not vary.
+        mix: (e, p) how much of each unknown goes into each value.
+        scale: (p,) size of each unknown, so that theta is of order one.
+        nominal: (e,) values of the model.
+        listed: what each value is.
+    """
+
+    directions: tuple[Matrix, Matrix, Matrix]
+    inverse: Matrix
+    base: Matrix
+    mix: Matrix
+    scale: Matrix
+    nominal: Matrix
+    listed: tuple[Element, ...] = eqx.field(static=True)
+
+    def matrices(self, theta: Array) -> Triple:
+        """M, D, K."""
+        values = self.values(theta)
+        M, D, K = (jnp.einsum("e,eij->ij", values, jnp.asarray(x)) for x in self.directions)
+        return M, D, K
+
+    def values(self, theta: Array) -> Float[Array, " e"]:
+        """Of all elements, SI units."""
+        return jnp.asarray(self.base) + self.mix @ (theta * self.scale)
+
+    def unknowns(self, matrices: Triple) -> Array:
+        """Those of least squares."""
+        entries = jnp.concatenate([jnp.asarray(x).ravel() for x in matrices])
+        return self.of_values(jnp.asarray(self.inverse) @ entries)
+
+    def of_values(self, values: Float[Array, " e"]) -> Array:
+        """Unknowns of values, of least squares where these contradict what is held or tied."""
+        mix = jnp.asarray(self.mix)
+        square = (mix**2).sum(axis=0)  # no two unknowns share an element
+        return (values - self.base) @ mix / jnp.where(square > 0, square, 1.0) / self.scale
+
+    def held(self, which: np.ndarray, values: np.ndarray) -> "LinearMatrices":
+        """The same with some unknowns, (p,) of bool, held at values (p,) from now on.
+
+        Args:
+            which: the unknowns.
+            values: SI units; those of other unknowns are not used.
+        """
+        base = np.asarray(self.base) + np.asarray(self.mix) @ np.where(which, values, 0.0)
+        return eqx.tree_at(
+            lambda x: (x.base, x.mix), self, (base, np.where(which, 0.0, np.asarray(self.mix)))
+        )
+
+
+def element_matrices(model: LumpedModel) -> LinearMatrices:
+    """The unknowns that a model has: masses, dampings, stiffnesses of its elements, in this order.
+
+    A spring may damp, also where the model gives it none; a connection without stiffness stays so, since what no
+    spring holds is a matter of structure. Matrices are taken apart into masses, and springs and dampers between bodies
+    and to the ground.
+
+    Args:
+        model: says which there are; its numbers give their sizes.
+    """
+    shapes, names, values = _entries(model) if model.matrices is not None else _elements(model)
+    counts = np.cumsum([0, *(len(x) for x in shapes)])
+    directions = [
+        np.pad(x, ((counts[i], counts[3] - counts[i + 1]), (0, 0), (0, 0))) for i, x in enumerate(shapes)
+    ]
+    whole = np.concatenate([x.reshape(counts[3], -1) for x in directions], axis=1)
+    return LinearMatrices(
+        (directions[0], directions[1], directions[2]),
+        inverse=np.linalg.pinv(whole.T),
+        base=np.zeros(counts[3]),
+        mix=np.diag(np.concatenate([np.ones(counts[2]), 1.0 * (values[2] != 0)])),
+        scale=np.concatenate([_sizes(x) for x in values]),
+        nominal=np.concatenate(values),
+        listed=tuple(Element(e, q) for q, elements in zip(QUANTITIES, names, strict=True) for e in elements),
+    )
+
+
+Parts = tuple[list[np.ndarray], list[list[str]], list[np.ndarray]]
+
+
+def _elements(model: LumpedModel) -> Parts:
+    """For M, D and K what each unknown adds, (count, N, N), their names, their nominal values."""
+    bodies, joints = np.eye(len(model.bodies)), incidence(model).T
+    shapes = [np.einsum("pi,pj->pij", x, x) for x in (bodies, joints, joints)]
+    connections = [c.name for c in model.connections]
+    values = [np.asarray(getattr(model, quantity)) for quantity in QUANTITIES]
+    return shapes, [list(model.bodies), connections, connections], values
+
+
+def _entries(model: LumpedModel) -> Parts:
+    """Springs and dampers that matrices are made of: between two bodies where their entry is not zero, to the ground
+    where the sum of a row is not zero; masses and what couples them."""
+    names = [GROUND, *model.bodies]
+    mass, damping, stiffness = (np.asarray(getattr(model.matrices, quantity)) for quantity in QUANTITIES)
+    found = [_masses(mass), _joints(damping, stiffness), _joints(stiffness, stiffness)]
+    listed = [[_pair(names[i], names[j]) for i, j, _, _ in one] for one in found]
+    shapes = [np.array([x for *_, x in one]).reshape(-1, *[len(model.bodies)] * 2) for one in found]
+    return shapes, listed, [np.array([value for _, _, value, _ in one]) for one in found]
+
+
+def _pair(one: str, other: str) -> str:
+    return one if one == other else f"{one}, {other}"
+
+
+Couplings = list[tuple[int, int, float, np.ndarray]]
+
+
+def _masses(matrix: np.ndarray) -> Couplings:
+    """Ends (from 1), value and shape of each entry that is not zero."""
+    every, at = np.eye(len(matrix)), np.argwhere(np.triu(matrix))
+    shapes = [np.outer(every[i], every[j]) for i, j in at]
+    found = zip(at.tolist(), shapes, strict=True)
+    return [(i + 1, j + 1, float(matrix[i, j]), np.maximum(x, x.T)) for (i, j), x in found]
+
+
+def _joints(matrix: np.ndarray, other: np.ndarray) -> Couplings:
+    """Ends (0 the ground), value and shape of each spring or damper that is there in either of two matrices."""
+    found, every = [], np.eye(len(matrix))
+    for i in range(len(matrix)):
+        if any(abs(x[i].sum()) > ROUNDING * np.abs(x[i]).sum() for x in (matrix, other)):
+            found.append((0, i + 1, matrix[i].sum(), np.outer(every[i], every[i])))
+        for j in range(i + 1, len(matrix)):
+            if matrix[i, j] != 0 or other[i, j] != 0:
+                joint = every[i] - every[j]
+                found.append((i + 1, j + 1, -matrix[i, j], np.outer(joint, joint)))
+    return found
+
+
+def _sizes(values: np.ndarray) -> np.ndarray:
+    """Their own, or where zero that of the others."""
+    sizes = np.abs(values)
+    usual = np.median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
+    return np.where(sizes > 0, sizes, usual)
+
+
+def with_values(model: LumpedModel, values: Float[np.ndarray, " p"]) -> LumpedModel:
+    """The model with other values of its `element_matrices`, in their order; effects are left out.
+
+    Args:
+        model: whose unknowns they are.
+        values: of all of them, SI units.
+    """
+    places = {
+        "inputs": model.inputs,
+        "sensors": model.sensors,
+        "tolerance": model.tolerance,
+        "name": model.name,
+    }
+    if model.matrices is not None:
+        directions = element_matrices(model).directions
+        found = (as_array(np.einsum("p,pij->ij", values, np.asarray(x))) for x in directions)
+        return lumped_model(model.bodies, matrices=Matrices(*found), **places)
+    bodies, joints = len(model.bodies), len(model.connections)
+    mass, damping, stiffness = (as_array(x) for x in np.split(values, [bodies, bodies + joints]))
+    return lumped_model(model.bodies, mass, stiffness, damping, connections=model.connections, **places)
