@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from jaxsid.modes import modal_realization as modal_realization
     from jaxsid.physical.cbsi import cbsi as cbsi
     from jaxsid.pipeline.identify import identify as identify
+    from jaxsid.pipeline.refine import refine as refine
     from jaxsid.realization.era import era as era
     from jaxsid.realization.era_dc import era_dc as era_dc
     from jaxsid.realization.order import select_order as select_order
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from jaxsid.records import Realization as Realization
     from jaxsid.records import Record as Record
     from jaxsid.records import SecondOrderModel as SecondOrderModel
+    from jaxsid.refinement import Refinement as Refinement
     from jaxsid.uncertainty.ensemble import ensemble as ensemble
     from jaxsid.uncertainty.monte_carlo import monte_carlo as monte_carlo
     from jaxsid.uncertainty.noise import CorrelatedNoise as CorrelatedNoise
@@ -68,6 +70,8 @@ _HOMES = {
     "jaxsid.files.record_file": ("read_record", "read_records"),
     "jaxsid.identification": ("Identification",),
     "jaxsid.pipeline.identify": ("identify",),
+    "jaxsid.pipeline.refine": ("refine",),
+    "jaxsid.refinement": ("Refinement",),
     "jaxsid.impulse.direct": ("Direct",),
     "jaxsid.impulse.ensemble": ("WaveletEnsemble",),
     "jaxsid.impulse.estimate": ("impulse_response",),

@@ -29,6 +29,7 @@ LAYERS = (
     "physical",
     "uncertainty",
     "identification",
+    "refinement",
     "gap",
     "pipeline",
     "study",

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.mechanics.lumped import GROUND, LumpedModel, Matrices, incidence, lumped_model
-from jaxsid.physical.parameterization import Matrix, Triple
+from jaxsid.physical.parameterization import BLIND, Matrix, Triple
 from jaxsid.records import as_array
 
 QUANTITIES = ("mass", "damping", "stiffness")
+TRACE = 1e-4  # part of an unknown in such combinations from which on it is not determined
 ROUNDING = 1e-9  # sum of a row, next to its entries, that is none
 
 
@@ -128,6 +129,44 @@ def element_matrices(model: LumpedModel) -> LinearMatrices:
     )
 
 
+def blind_elements(unknowns: LinearMatrices, information: Float[np.ndarray, "p p"]) -> np.ndarray:
+    """(e,) which elements are part of a combination of unknowns of which nothing is known.
+
+    Args:
+        unknowns: those of the fit.
+        information: inverse of their covariance, singular where nothing is known.
+    """
+    root = np.sqrt(np.diag(information))
+    safe = np.where(root > 0, root, 1.0)
+    values, vectors = np.linalg.eigh(information / safe / safe[:, None])
+    lost = np.linalg.norm(vectors[:, values < BLIND * values[-1]], axis=1)
+    return (np.asarray(unknowns.mix) != 0) @ ((lost > TRACE) | (root == 0))
+
+
+def element_values(
+    unknowns: LinearMatrices, theta: Array, covariance: Float[np.ndarray, "p p"], blind: np.ndarray
+) -> ElementValues:
+    """Values, standard deviations and correlation of the elements.
+
+    Args:
+        unknowns: those of the fit.
+        theta: found.
+        covariance: of theta.
+        blind: (e,) elements that are not determined.
+    """
+    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
+    moved = mix @ covariance @ mix.T
+    spread = np.sqrt(np.maximum(np.diag(moved), 0.0))
+    safe = np.where(~blind & (spread > 0), spread, np.nan)
+    return ElementValues(
+        unknowns.listed,
+        values=as_array(np.asarray(unknowns.values(theta))),
+        deviation=as_array(np.where(blind, np.inf, spread)),
+        correlation=as_array(moved / safe / safe[:, None]),
+        nominal=as_array(np.asarray(unknowns.nominal)),
+    )
+
+
 Parts = tuple[list[np.ndarray], list[list[str]], list[np.ndarray]]
 
 
@@ -186,7 +225,7 @@ def _sizes(values: np.ndarray) -> np.ndarray:
     return np.where(sizes > 0, sizes, usual)
 
 
-def with_values(model: LumpedModel, values: Float[np.ndarray, " p"]) -> LumpedModel:
+def with_values(model: LumpedModel, values: Float[Array, " p"]) -> LumpedModel:
     """The model with other values of its `element_matrices`, in their order; effects are left out.
 
     Args:
@@ -201,8 +240,8 @@ def with_values(model: LumpedModel, values: Float[np.ndarray, " p"]) -> LumpedMo
     }
     if model.matrices is not None:
         directions = element_matrices(model).directions
-        found = (as_array(np.einsum("p,pij->ij", values, np.asarray(x))) for x in directions)
+        found = (jnp.einsum("p,pij->ij", values, jnp.asarray(x)) for x in directions)
         return lumped_model(model.bodies, matrices=Matrices(*found), **places)
     bodies, joints = len(model.bodies), len(model.connections)
-    mass, damping, stiffness = (as_array(x) for x in np.split(values, [bodies, bodies + joints]))
+    mass, damping, stiffness = jnp.split(values, [bodies, bodies + joints])
     return lumped_model(model.bodies, mass, stiffness, damping, connections=model.connections, **places)

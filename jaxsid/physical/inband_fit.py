@@ -22,13 +22,12 @@ from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
 from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
-from jaxsid.physical.parameterization import Parameterization, Triple
+from jaxsid.physical.parameterization import BLIND, Parameterization, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
 STEPS = 200
 # An unknown that moves M, D, K less than this, next to the one that moves them most, is at an edge.
 STILL = 1e-4
-BLIND = 1e-10  # of the largest eigenvalue of scaled J'J: a combination that leaves no trace
 
 
 class Target(NamedTuple):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+BLIND = 1e-10  # of the largest eigenvalue of scaled J'J: nothing is known of that combination of unknowns
 Matrix = Array | np.ndarray
 Triple = tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]
 

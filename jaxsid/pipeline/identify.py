@@ -173,7 +173,7 @@ def identified_model(
         elements: values of the model's elements; None for matrices.
     """
     if elements is not None:
-        return with_values(nominal, np.asarray(elements.values))
+        return with_values(nominal, elements.values)
     symmetric = [np.asarray(x) for x in (found.mass, found.damping, found.stiffness)]
     mass, damping, stiffness = (0.5 * (x + x.T) for x in symmetric)
     return lumped_model(

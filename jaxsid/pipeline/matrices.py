@@ -8,19 +8,19 @@ from jaxtyping import Array
 from jaxsid.checks import JaxsidError
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.physical.cbsi import cbsi
-from jaxsid.physical.elements import ElementValues
+from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.physical.inband_fit import MatrixFit, Target, fit_matrices, fit_target
 from jaxsid.physical.parameterization import PositiveMatrices, SymmetricMatrices, Triple, entry_sizes
+from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.setting import Setting
 from jaxsid.pipeline.state_space import StateSpace
 from jaxsid.pipeline.structure import (
     ElementFit,
     as_good,
-    element_values,
     fit_elements,
+    fitted_values,
     uncontradicted,
     undetermined,
-    widened_start,
 )
 from jaxsid.records import SecondOrderModel, as_array
 
@@ -52,7 +52,7 @@ def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, struct
         space: the state-space model.
         structure: "free" for symmetric matrices, "model" for its elements, "auto" for these if they fit as well.
     """
-    sensed = _sensed(model, system)
+    sensed = sensed_rows(model, system)
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     if system.one_a_body is None:
         return _by_elements_alone(model, system, space, target, sensed, structure)
@@ -60,7 +60,7 @@ def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, struct
     elements, free = _elements_and_free(model, system, space, target, sensed, structured, structure)
     if elements is not None:
         notes = (*trouble, *_notes(elements.fit, structured))
-        return _found(sensed, structured, elements.fit, element_values(elements), notes)
+        return _found(sensed, structured, elements.fit, fitted_values(elements), notes)
     contradicted = () if structure == "free" or free is None else (_contradicted(free),)
     fit, held = _positive_fit(system, space, target, sensed, free)
     notes = (*trouble, *_notes(fit, structured), *contradicted, *((AT_THE_EDGE,) if held else ()))
@@ -132,7 +132,7 @@ def _by_elements_alone(
     if structure == "free":
         return nothing
     highest = 2 * np.pi * float(np.asarray(space.lines.band)[1])
-    start = widened_start(model, space, sensed, highest)
+    start = widened_start(element_matrices(model), space.model, sensed, highest)
     elements = fit_elements(model, target, start, sensed)
     if elements is None or not _positive(elements.fit.matrices) or float(elements.fit.misfit) > POOR:
         return nothing
@@ -143,7 +143,7 @@ def _by_elements_alone(
         )
     bare = ", ".join(b for i, b in enumerate(model.bodies) if i not in system.places)
     note = f"No sensor on {bare}: mass, damping and stiffness there follow from the model's structure."
-    return _found(sensed, None, elements.fit, element_values(elements), (note, *_notes(elements.fit, None)))
+    return _found(sensed, None, elements.fit, fitted_values(elements), (note, *_notes(elements.fit, None)))
 
 
 def _contradicted(free: MatrixFit) -> str:
@@ -164,8 +164,13 @@ def _too_few(model: LumpedModel, system: Setting) -> str:
     )
 
 
-def _sensed(model: LumpedModel, system: Setting) -> SecondOrderModel:
-    """The nominal model with the rows of the measured sensors only."""
+def sensed_rows(model: LumpedModel, system: Setting) -> SecondOrderModel:
+    """The nominal model with the rows of the measured sensors only.
+
+    Args:
+        model: nominal.
+        system: which sensors were measured.
+    """
     whole = second_order(model)
     rows = np.array([[s.name for s in model.sensors].index(n) for n in system.outputs])
     return SecondOrderModel(

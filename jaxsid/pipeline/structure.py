@@ -2,24 +2,22 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxsid.compilation import compiled
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.physical.elements import ElementValues, LinearMatrices, element_matrices
-from jaxsid.physical.inband_fit import BLIND, MatrixFit, Target, fit_matrices
-from jaxsid.physical.parameterization import Triple
-from jaxsid.pipeline.state_space import StateSpace
-from jaxsid.records import SecondOrderModel, as_array
+from jaxsid.physical.elements import (
+    ElementValues,
+    LinearMatrices,
+    blind_elements,
+    element_matrices,
+    element_values,
+)
+from jaxsid.physical.inband_fit import MatrixFit, Target, fit_matrices
+from jaxsid.physical.parameterization import BLIND, Triple
+from jaxsid.records import SecondOrderModel
 
 CHANCE = 2.326  # standard deviations that chance exceeds once in a hundred times
-TRACE = 1e-4  # part of an unknown in such combinations from which on it is not determined
-# Damping ratios that are added to every mode in turn, so that modes far from where they are to be are seen from there.
-WIDENED = (0.5, 0.2, 0.06)
-POINTS = 96  # frequencies of a widened response
 
 
 class ElementFit(NamedTuple):
@@ -99,69 +97,15 @@ def undetermined(found: ElementFit) -> np.ndarray:
     Args:
         found: the fit.
     """
-    scaled, root = _scaled(found.fit)
-    values, vectors = np.linalg.eigh(scaled)
-    lost = np.linalg.norm(vectors[:, values < BLIND * values[-1]], axis=1)
-    return (np.asarray(found.unknowns.mix) != 0) @ ((lost > TRACE) | (root == 0))
+    return blind_elements(found.unknowns, np.asarray(found.fit.information))
 
 
-def element_values(found: ElementFit) -> ElementValues:
+def fitted_values(found: ElementFit) -> ElementValues:
     """Values, standard deviations and correlation of the elements.
 
     Args:
         found: the fit.
     """
-    unknowns = found.unknowns
-    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
-    covariance = mix @ np.asarray(found.fit.covariance) @ mix.T
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    blind = undetermined(found)
-    safe = np.where(~blind & (spread > 0), spread, np.nan)
-    return ElementValues(
-        unknowns.listed,
-        values=as_array(np.asarray(unknowns.values(found.fit.unknowns))),
-        deviation=as_array(np.where(blind, np.inf, spread)),
-        correlation=as_array(covariance / safe / safe[:, None]),
-        nominal=as_array(np.asarray(unknowns.nominal)),
+    return element_values(
+        found.unknowns, found.fit.unknowns, np.asarray(found.fit.covariance), undetermined(found)
     )
-
-
-def widened_start(model: LumpedModel, space: StateSpace, sensed: SecondOrderModel, highest: float) -> Triple:
-    """M, D, K near those of the state-space model, found from the nominal ones over responses of ever narrower peaks.
-
-    The responses are those of the identified model on rays s = w (z + j sqrt(1 - z^2)) off the imaginary axis, where
-    every mode has z more of damping: peaks that are apart by half of their frequencies still overlap there.
-
-    Args:
-        model: nominal.
-        space: the state-space model.
-        sensed: gives the input matrix and the sensors.
-        highest: rad/s, the end of the band.
-    """
-    matrices: Triple = (sensed.mass, sensed.damping, sensed.stiffness)
-    unknowns = element_matrices(model)
-    sizes = np.abs(np.linalg.eigvals(np.asarray(space.model.A)))
-    lowest = max(sizes.min(), 1e-3 * sizes.max()) / 3
-    w = np.geomspace(lowest, max(highest, 3 * lowest), POINTS)
-    for ratio in WIDENED:
-        s = jax.device_put(w * (ratio + 1j * np.sqrt(1 - ratio**2)))
-        target = _response_target(space, s)
-        matrices = fit_matrices(target, unknowns, matrices, sensed).matrices
-    return matrices
-
-
-def _response_target(space: StateSpace, s: Array) -> Target:
-    """The identified model's response to each input in turn at points s, as lines without transients."""
-    return _stacked(space.model.A, space.model.B, space.model.C, space.model.D, s)
-
-
-@compiled
-def _stacked(A: Array, B: Array, C: Array, D: Array, s: Array) -> Target:
-    inner = jnp.linalg.solve(s[:, None, None] * jnp.eye(len(A)) - A, B.astype(s.dtype))
-    y = jnp.swapaxes(C @ inner + D, 0, 1)  # outputs, points, inputs
-    count = len(s) * B.shape[1]
-    y = jnp.swapaxes(y, 1, 2).reshape(len(C), count).T
-    drive = jnp.repeat(jnp.eye(B.shape[1], dtype=s.dtype), len(s), axis=0)
-    points = jnp.tile(s, B.shape[1])
-    weight = 1 / jnp.maximum(jnp.abs(y), 1e-3 * jnp.abs(y).max(axis=0))
-    return Target(points, points, jnp.zeros((count, 1)), jnp.zeros(1), drive, y, weight)

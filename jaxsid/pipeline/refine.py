@@ -1,0 +1,81 @@
+"""Refinement of a model's numbers against measurements: records, impulse responses or frequency responses."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from jaxtyping import ArrayLike
+
+from jaxsid.checks import is_concrete, require
+from jaxsid.impulse.spectra import FrequencyResponse
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.measured import check_response
+from jaxsid.physical.restrictions import restricted
+from jaxsid.pipeline.refine_records import refine_records
+from jaxsid.pipeline.refine_responses import refine_frequencies, refine_response, refine_traced
+from jaxsid.records import ImpulseResponse, Record
+from jaxsid.refinement import Refinement
+from jaxsid.uncertainty.noise import ResponseNoise
+
+Progress = Callable[[str], None]
+Pair = tuple[float, float]
+
+
+def refine(
+    model: LumpedModel,
+    data: Record | Sequence[Record] | ImpulseResponse | FrequencyResponse,
+    *,
+    fixed: Sequence[str] = (),
+    tied: Sequence[Sequence[str]] = (),
+    bounds: Mapping[str, Pair] | None = None,
+    priors: Mapping[str, Pair] | None = None,
+    noise: ResponseNoise | None = None,
+    dt: ArrayLike | None = None,
+    band: Pair | None = None,
+    validate: bool = True,
+    progress: Progress | None = None,
+) -> Refinement:
+    """The masses, dampings and stiffnesses of a model that explain measurements best, and how certain each is.
+
+    minimize sum |w (y - y(theta))|^2 + sum ((theta - mean) / std)^2 within bounds, w one over the noise. The model may
+    be off by half: fits to widened resonances lead to the right ones. Bodies need no sensor as long as the model's
+    structure lets the others tell of them. Of an impulse response that is traced, as under `jax.vmap`, the fit alone is
+    done, from the model's numbers.
+
+    Args:
+        model: elements or matrices, whose zero couplings stay zero; SI units.
+        data: records, each with its own length, rate, sensors and initial state, which is estimated; or an impulse
+            response; or a frequency response.
+        fixed: names of values that keep the model's number, such as "load.mass" or "*.damping".
+        tied: groups of names that keep the ratios that the model gives them.
+        bounds: lowest and highest value by name; values of elements are not negative anyway.
+        priors: mean and standard deviation by name.
+        noise: of an impulse response; estimated where None. That of records always is, with its colour.
+        dt: sampling interval (s) of the records that a frequency response came from; None if it is one in continuous
+            time.
+        band: frequencies (Hz) of records to use; None finds what the inputs excite.
+        validate: fit first to a part of the data and predict the rest: the first three quarters of every record, three
+            of four samples of a response.
+        progress: called with a line of text as each stage begins.
+
+    Returns:
+        Refinement.
+
+    Raises:
+        InputError: names, bounds, priors or data that cannot be used, a value that nothing in the data depends on.
+        InsufficientDataError: the records cannot support an answer.
+
+    Source: R. Pintelon and J. Schoukens, System Identification, 2nd ed., ch. 9; M. Friswell and J. Mottershead, Finite
+    Element Model Updating in Structural Dynamics, 1995.
+    """
+    say = progress or (lambda text: None)
+    require(not model.effects, f"{model.name}: models with effects cannot be refined by this version.")
+    known = restricted(model, fixed=fixed, tied=tied, bounds=bounds, priors=priors)
+    if isinstance(data, ImpulseResponse):
+        check_response(data, len(model.sensors), len(model.inputs))
+        if not is_concrete(data.h):
+            return refine_traced(model, known, data, noise)
+        return refine_response(model, known, data, noise, validate, say)
+    require(noise is None, "noise belongs to an impulse response; that of other data is estimated.")
+    if isinstance(data, FrequencyResponse):
+        return refine_frequencies(model, known, data, dt, validate, say)
+    records = (data,) if isinstance(data, Record) else tuple(data)
+    return refine_records(model, known, records, band, validate, say)

@@ -1,0 +1,174 @@
+"""Refinement against raw records, through the Fourier lines that their inputs excite."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxsid.checks import InsufficientDataError
+from jaxsid.impulse.lines import Lines, record_lines
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.mechanics.simulate import simulate
+from jaxsid.physical.inband_fit import Target, fit_target
+from jaxsid.physical.restrictions import Restricted
+from jaxsid.physical.terms import LineTerm
+from jaxsid.physical.widened import widened_start
+from jaxsid.pipeline.matrices import sensed_rows
+from jaxsid.pipeline.refining import Problem, concluded, fitted_model, nominal_unknowns, solved
+from jaxsid.pipeline.setting import setting
+from jaxsid.pipeline.state_space import StateSpace, state_space
+from jaxsid.records import Record, as_array
+from jaxsid.refinement import Refinement, Residuals, Validation
+
+HELD_OUT = 0.25  # part of the end of every record that is kept for validation
+LAGS = 200  # of the correlations of what is left, at most
+ONE_PERCENT = 2.576  # standard deviations that chance exceeds once in a hundred times, either side
+Say = Callable[[str], None]
+Pair = tuple[float, float]
+
+
+def refine_records(
+    model: LumpedModel,
+    known: Restricted,
+    records: tuple[Record, ...],
+    band: Pair | None,
+    validate: bool,
+    say: Say,
+) -> Refinement:
+    system = setting(model, records)
+    say("poles and noise in the excited band")
+    lines = record_lines(records, outputs=system.outputs, band=band)
+    space = state_space(records, lines, order=None, expected=system.visible)
+    if not space.stable:
+        raise InsufficientDataError(
+            "the records show an unstable system: a model of masses, springs and dampers cannot follow it."
+        )
+    sensed = sensed_rows(model, system)
+    say("a start from the poles")
+    highest = 2 * np.pi * float(np.asarray(space.lines.band)[1])
+    near = known.unknowns.unknowns(widened_start(known.unknowns, space.model, sensed, highest))
+    every = LineTerm(_target(space, space.lines, np.asarray(space.polished.noise)), sensed)
+    early, late = zip(*(_split(r) for r in records), strict=True)
+    train = None
+    if validate:
+        low, high = np.asarray(space.lines.band).tolist()
+        first = _padded(record_lines(early, outputs=system.outputs, band=(low, high)), len(space.lines.z))
+        train = (LineTerm(_target(space, first, _noise_on(first, space)), sensed),)
+    say("mass, damping and stiffness")
+    nuisances = len(records) * (2 * len(model.bodies) + 1) * len(system.outputs)
+    problem = Problem(known, (every,), train, (near, nominal_unknowns(known)), nuisances)
+    fit, before = solved(problem)
+    say("validation")
+
+    def errors(m: LumpedModel, given: Sequence[Record] = records) -> np.ndarray:
+        return _time_errors(m, given, system.outputs)
+
+    validation = None
+    if before is not None:
+        trained = fitted_model(model, before)
+        validation = Validation(
+            as_array(errors(model, late)), as_array(errors(trained, late)), "the last quarter of every record"
+        )
+    residuals = lambda m: _residuals(m, records, system.outputs)  # noqa: E731
+    return concluded(problem, model, fit, None, system.outputs, errors, validation, residuals)
+
+
+def _target(space: StateSpace, lines: Lines, noise: np.ndarray) -> Target:
+    return fit_target(lines, as_array(noise), space.polished.realization, space.model)
+
+
+def _split(record: Record) -> tuple[Record, Record]:
+    """What is fitted, and what comes after it."""
+    cut = len(record.y) - int(HELD_OUT * len(record.y))
+    parts = [
+        Record(
+            np.asarray(record.u)[rows],
+            np.asarray(record.y)[rows],
+            record.dt,
+            inputs=record.inputs,
+            outputs=record.outputs,
+            hold=record.hold,
+            name=f"{record.name}, {which}",
+        )
+        for rows, which in ((slice(None, cut), "first part"), (slice(cut, None), "last part"))
+    ]
+    return parts[0], parts[1]
+
+
+def _padded(lines: Lines, count: int) -> Lines:
+    """As many lines as another set has, so that both share compiled programs; those that are added weigh nothing."""
+    more = max(count - len(lines.z), 0)
+
+    def grown(x: np.ndarray, fill: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.asarray(x), np.broadcast_to(fill, (more, *np.shape(x)[1:]))])
+
+    at = [np.asarray(lines.z)[0], np.asarray(lines.omega)[0], 0.0, 0.0, 0.0, 0.0]
+    fields = lines.z, lines.omega, lines.u, lines.y, lines.weight, lines.record
+    new = tuple(as_array(grown(np.asarray(x), np.asarray(f))) for x, f in zip(fields, at, strict=True))
+    return eqx.tree_at(lambda x: (x.z, x.omega, x.u, x.y, x.weight, x.record), lines, new)
+
+
+def _noise_on(lines: Lines, space: StateSpace) -> np.ndarray:
+    """Noise of lines of a part of the records, from that of the whole, between neighbouring frequencies."""
+    given, level = space.lines, np.log(np.asarray(space.polished.noise))
+    owner, wanted = (
+        np.where(np.asarray(x.weight).any(axis=1), np.asarray(x.record).argmax(axis=1), -1)
+        for x in (given, lines)
+    )
+    found = np.zeros(lines.y.shape)
+    for record in range(given.record.shape[1]):
+        known, sought = owner == record, wanted == record
+        points, at = np.asarray(given.omega)[known], np.asarray(lines.omega)[sought]
+        for output in range(found.shape[1]):
+            found[sought, output] = np.interp(at, points, level[known, output])
+    return np.exp(found)
+
+
+def _time_errors(model: LumpedModel, records: Sequence[Record], outputs: Sequence[str]) -> np.ndarray:
+    """rms(y - yhat) / rms(y) of each output over records, each from its own initial state."""
+    left, size = np.zeros(len(outputs)), np.zeros(len(outputs))
+    for record in records:
+        rows = [outputs.index(n) for n in record.outputs]
+        error = _left(model, record)
+        left[rows] += (error**2).sum(axis=0)
+        size[rows] += (np.asarray(record.y) ** 2).sum(axis=0)
+    return np.sqrt(left / np.where(size > 0, size, 1.0))
+
+
+def _left(model: LumpedModel, record: Record) -> np.ndarray:
+    order = [s.name for s in model.sensors]
+    columns = [order.index(n) for n in record.outputs]
+    return np.asarray(record.y) - np.asarray(simulate(model, record, initial="estimate"))[:, columns]
+
+
+def _residuals(model: LumpedModel, records: Sequence[Record], outputs: Sequence[str]) -> Residuals:
+    """Correlations of what the model leaves of the longest record that has all outputs, else of the longest."""
+    record = max(records, key=lambda r: (len(r.outputs), len(r.y)))
+    error = _left(model, record)
+    samples, lags = len(error), min(LAGS, len(error) // 4)
+    error = error - error.mean(axis=0)
+    u = np.asarray(record.u) - np.asarray(record.u).mean(axis=0)
+    size = 2 * samples
+    error = error / np.maximum(error.std(axis=0), np.finfo(float).tiny)
+    u = u / np.maximum(u.std(axis=0), np.finfo(float).tiny)
+    E, U = np.fft.rfft(error, size, axis=0), np.fft.rfft(u, size, axis=0)
+    own, driving = (np.fft.irfft(np.abs(x) ** 2, size, axis=0) / samples for x in (E, U))
+    both = np.fft.irfft(E[:, :, None] * U.conj()[:, None, :], size, axis=0) / samples
+    # the variance of a cross-correlation of independent signals: the sum of the products of their autocorrelations
+    spread = np.sqrt(np.maximum((own[:, :, None] * driving[:, None, :]).sum(axis=0), 0.0) / samples)
+    rows = [outputs.index(n) for n in record.outputs]
+    autocorrelation = np.full((lags + 1, len(outputs)), np.nan)
+    cross = np.full((2 * lags + 1, len(outputs), u.shape[1]), np.nan)
+    limit = np.full((len(outputs), u.shape[1]), np.nan)
+    autocorrelation[:, rows] = own[: lags + 1]
+    cross[:, rows] = np.concatenate([both[-lags:], both[: lags + 1]])
+    limit[rows] = ONE_PERCENT * spread
+    dt = float(record.dt)
+    return Residuals(
+        lags=as_array(dt * np.arange(lags + 1)),
+        autocorrelation=as_array(autocorrelation),
+        white_limit=float(ONE_PERCENT / np.sqrt(samples)),
+        cross_lags=as_array(dt * np.arange(-lags, lags + 1)),
+        cross_correlation=as_array(cross),
+        cross_limit=as_array(limit),
+    )

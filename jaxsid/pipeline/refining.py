@@ -1,0 +1,256 @@
+"""What every refinement does, whatever the data: fit from several starts, covariance, validation, warnings."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.checks import bad_input, require
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.elements import (
+    ElementValues,
+    LinearMatrices,
+    blind_elements,
+    element_values,
+    with_values,
+)
+from jaxsid.physical.posterior import BoundedFit, squares_at, within_bounds
+from jaxsid.physical.restrictions import Restricted
+from jaxsid.physical.terms import ResponseTerm, Term
+from jaxsid.pipeline.matrices import GOOD, POOR
+from jaxsid.records import as_array
+from jaxsid.refinement import Refinement, Residuals, Validation
+from jaxsid.uncertainty.noise import CorrelatedNoise, ResponseNoise
+
+Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
+
+
+class Problem(NamedTuple):
+    """What is fitted.
+
+    Attributes:
+        known: unknowns, bounds, priors.
+        every: all of the data.
+        train: the part for the fit before validation, None without.
+        starts: unknowns to begin with, the most promising first.
+        nuisances: number of unknowns, such as those of transients, that the terms project out.
+        weighed: whether the level of the noise is known, so that a fit can be told to be good.
+    """
+
+    known: Restricted
+    every: tuple[Term, ...]
+    train: tuple[Term, ...] | None
+    starts: tuple[Array, ...]
+    nuisances: int = 0
+    weighed: bool = True
+
+
+def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
+    """Fits to all and to a part of the data, from the start that leads to the least misfit."""
+    known, first = problem.known, problem.train or problem.every
+    best, least = None, np.inf
+    for start in problem.starts:
+        if not np.isfinite(float(squares_at(first, known.unknowns, start))):
+            continue
+        fit = within_bounds(first, known, start)
+        squares = float(fit.posterior.squares)
+        if squares < least:
+            best, least = fit, squares
+        if problem.weighed and squares < GOOD * float(fit.posterior.equations):
+            break
+    if best is None:
+        bad_input(
+            "the model's numbers lead to a response that is not finite, so that no fit can start from them. Check that "
+            "masses are positive and that springs and dampers are not negative."
+        )
+    _check_told(known, best)
+    if problem.train is None:
+        return best, None
+    return within_bounds(problem.every, known, best.posterior.theta), best
+
+
+def _check_told(known: Restricted, fit: BoundedFit) -> None:
+    told = (np.diag(np.asarray(fit.posterior.information)) > 0) | (np.asarray(known.prior.weight) > 0)
+    silent = [name for name, t, held in zip(known.names, told, fit.at_bound, strict=True) if not (t or held)]
+    require(
+        not silent,
+        f"nothing in these data depends on {', '.join(silent)}. Fix it, give it a prior, or measure where it acts.",
+    )
+
+
+class _Uncertain(NamedTuple):
+    """Of the unknowns: covariance, share of the data, misfit, information of data and prior."""
+
+    covariance: np.ndarray
+    share: np.ndarray
+    misfit: float
+    information: np.ndarray
+
+
+def _uncertainty(problem: Problem, fit: BoundedFit, noise: ResponseNoise | None) -> _Uncertain:
+    """The posterior's covariance near its mode; noise beyond what was assumed widens it."""
+    p = fit.posterior
+    free = problem.nuisances + int((np.diag(np.asarray(p.information)) > 0).sum())
+    misfit = float(p.squares) / max(int(p.equations) - free, 1)
+    told = np.asarray(p.information) / max(misfit, 1.0)
+    precision = np.diag(np.where(fit.at_bound, 0.0, np.asarray(problem.known.prior.weight)) ** 2)
+    both = told + precision
+    inverse = _inverse(both)
+    if isinstance(noise, CorrelatedNoise):
+        inverse = _sandwich(problem, fit, noise, inverse) + inverse @ precision @ inverse
+    prior = np.diag(precision)
+    share = np.where(prior > 0, 1 - np.diag(inverse) * prior, 1.0)
+    return _Uncertain(inverse, np.where(fit.at_bound, np.nan, share), misfit, both)
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    """Inverse where there is one: combinations of which nothing is known are left out."""
+    root = np.sqrt(np.diag(information))
+    safe = np.where(root > 0, root, 1.0)
+    values, vectors = np.linalg.eigh(information / safe / safe[:, None])
+    seen = values > 1e-14 * values[-1]
+    return (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / safe / safe[:, None]
+
+
+def _sandwich(problem: Problem, fit: BoundedFit, noise: CorrelatedNoise, inverse: np.ndarray) -> np.ndarray:
+    """Covariance of a fit whose weights are not those of its noise."""
+    (term,) = problem.every
+    assert isinstance(term, ResponseTerm)
+    rows = _weighted_rows(term, fit.unknowns, fit.posterior.theta)
+    return inverse @ np.asarray(noise.covariance(rows)) @ inverse
+
+
+def _weighted_rows(term: ResponseTerm, unknowns: LinearMatrices, theta: Array) -> Array:
+    """J' w of an impulse response, (p, samples, outputs, inputs)."""
+    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
+    mass, damping, stiffness = (jnp.asarray(np.einsum("ep,eij->pij", mix, x)) for x in unknowns.directions)
+    return term.left(unknowns.matrices(theta), (mass, damping, stiffness))[1:] * term.weight
+
+
+def _open(unknowns: LinearMatrices, information: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Combinations of unknowns of which nothing is known, each as a sum of changes relative to their sizes."""
+    root = np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(
+        information / np.where(root > 0, root, 1.0) / np.where(root > 0, root, 1.0)[:, None]
+    )
+    found = []
+    for vector in vectors[:, (values < 1e-10 * values[-1])].T:
+        parts = vector / np.where(root > 0, root, 1.0)
+        parts = np.where(np.asarray(unknowns.mix).any(axis=0) & (root > 0), parts, 0.0)
+        if not parts.any():
+            continue
+        parts = parts / np.abs(parts).max()
+        kept = np.flatnonzero(np.abs(parts) > 0.01)
+        found.append(" ".join(f"{parts[i]:+.2g} {names[i]}" for i in kept.tolist()))
+    return tuple(found)
+
+
+def concluded(
+    problem: Problem,
+    model: LumpedModel,
+    fit: BoundedFit,
+    noise: ResponseNoise | None,
+    outputs: tuple[str, ...],
+    errors: Errors,
+    validation: Validation | None,
+    residuals: Callable[[LumpedModel], Residuals] | None = None,
+) -> Refinement:
+    """Everything that is reported of a fit."""
+    certain = _uncertainty(problem, fit, noise)
+    unknowns, theta = fit.unknowns, fit.posterior.theta
+    blind = blind_elements(unknowns, certain.information)
+    values = element_values(unknowns, theta, certain.covariance, blind)
+    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
+    covariance = mix @ certain.covariance @ mix.T
+    covariance[blind], covariance[:, blind] = np.nan, np.nan
+    owner = np.abs(mix).argmax(axis=1)
+    share = np.where(mix.any(axis=1), certain.share[owner], np.nan)
+    refined = with_values(model, values.values)
+    held = tuple(n for n, at in zip(problem.known.names, fit.at_bound, strict=True) if at)
+    combinations = _open(unknowns, certain.information, problem.known.names)
+    return Refinement(
+        nominal=model,
+        model=refined,
+        elements=values,
+        covariance=as_array(covariance),
+        data_share=as_array(share),
+        misfit=as_array(np.asarray(certain.misfit)),
+        outputs=outputs,
+        before=as_array(errors(model)),
+        after=as_array(errors(refined)),
+        validation=validation,
+        residuals=None if residuals is None else residuals(refined),
+        at_bound=held,
+        open_combinations=combinations,
+        converged=fit.posterior.converged,
+        warnings=_warnings(
+            certain.misfit, values, held, combinations, validation, bool(fit.posterior.converged)
+        ),
+    )
+
+
+def _warnings(
+    misfit: float,
+    values: ElementValues,
+    held: tuple[str, ...],
+    combinations: tuple[str, ...],
+    validation: Validation | None,
+    converged: bool,
+) -> tuple[str, ...]:
+    said = []
+    if not converged:
+        said.append("The fit had not settled when its steps were used up; these are its last good values.")
+    if validation is not None and not validation.better:
+        said.append(
+            f"On data that were held out ({validation.data}) the refined model is no better than the one it started "
+            "from: do not trust the change."
+        )
+    if misfit > POOR:
+        said.append(
+            f"The model leaves {misfit:.3g} times the noise: its structure, the places or gains of its sensors, or the "
+            "hold of its inputs does not match the system."
+        )
+    if held:
+        said.append(
+            f"At a bound: {', '.join(held)}. Its standard deviation, and those of the others, ignore that."
+        )
+    if combinations:
+        said.append(
+            "Neither the data nor priors tell of these combinations of relative changes: "
+            f"{'; '.join(combinations)}. Fix one of each, or give it a prior."
+        )
+    vague = [
+        x.name
+        for x, value, std in zip(values.listed, values.values, values.deviation, strict=True)
+        if np.isfinite(std) and float(std) > abs(float(value)) > 0
+    ]
+    if vague:
+        said.append(f"Hardly determined, with a standard deviation above the value: {', '.join(vague)}.")
+    return tuple(said)
+
+
+def nominal_unknowns(known: Restricted) -> Array:
+    return known.unknowns.of_values(jnp.asarray(known.unknowns.nominal))
+
+
+def fitted_model(model: LumpedModel, fit: BoundedFit) -> LumpedModel:
+    """The model with the values of a fit.
+
+    Args:
+        model: nominal.
+        fit: its values.
+    """
+    return with_values(model, fit.unknowns.values(fit.posterior.theta))
+
+
+def relative_error(left: np.ndarray, whole: np.ndarray) -> Float[np.ndarray, " outputs"]:
+    """rms over time and inputs, relative to that of the data.
+
+    Args:
+        left: what is left, (samples, outputs, inputs).
+        whole: the data.
+    """
+    size = np.sqrt((np.abs(whole) ** 2).mean(axis=(0, 2)))
+    return np.sqrt((np.abs(left) ** 2).mean(axis=(0, 2))) / np.where(size > 0, size, 1.0)
