@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine notebooks clean
 
 setup: $(STAMP)
 
@@ -36,6 +36,9 @@ bench: $(STAMP) $(PEERS)/.installed
 	$(BIN)/python benchmarks/structure.py $(FIGURES)/structure.json
 	$(BIN)/python -m pytest benchmarks --benchmark-only -p no:cacheprovider --benchmark-json $(FIGURES)/timings.json
 	$(BIN)/python benchmarks/write_tables.py $(FIGURES)
+
+bench-refine: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/refinement.py
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)

@@ -52,8 +52,16 @@ def forward(residual: Callable[[Array], Array]) -> Callable[[Array], tuple[Array
     return evaluate
 
 
+Sums = tuple[Array, Array, Array]  # half of r'r, J'J, J'r
+
+
+def sums_of(residual: Array, jacobian: Array) -> Sums:
+    """What a step needs of a residual (equations,) and its Jacobian (equations, n)."""
+    return 0.5 * residual @ residual, jacobian.T @ jacobian, jacobian.T @ residual
+
+
 def levenberg_marquardt(
-    evaluate: Callable[[Array], tuple[Array, Array]],
+    evaluate: Callable[[Array], tuple[Array, Array] | Sums],
     start: Float[Array, " n"],
     *,
     max_steps: int | Array,
@@ -67,7 +75,8 @@ def levenberg_marquardt(
     from step to step.
 
     Args:
-        evaluate: maps the unknowns to the weighted residual (equations,) and its Jacobian (equations, n).
+        evaluate: maps the unknowns to the weighted residual (equations,) and its Jacobian (equations, n), or to the
+            three sums over them that are needed.
         start: (n,).
         max_steps: most evaluations.
         tolerance: stop when a helpful step lowers the cost by less than this part.
@@ -78,9 +87,9 @@ def levenberg_marquardt(
     """
     tiny = jnp.finfo(start.dtype).tiny
 
-    def products(value: Array) -> tuple[Array, Array, Array]:
-        r, j = evaluate(value if through is None else through(value))
-        return 0.5 * r @ r, j.T @ j, j.T @ r
+    def products(value: Array) -> Sums:
+        found = evaluate(value if through is None else through(value))
+        return found if len(found) == 3 else sums_of(*found)
 
     # the start is the first candidate, so that the evaluation is compiled once
     def advance(state: _State) -> _State:

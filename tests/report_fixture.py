@@ -13,6 +13,7 @@ from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.lumped import Connection, Input, LumpedModel, Sensor, lumped_model, second_order
 from jaxsid.mechanics.simulate import impulse_response_of
 from jaxsid.modes import modal
+from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.realization.era import era
 from jaxsid.realization.stabilization import stabilization
 from jaxsid.records import CbsiDiagnostics, ImpulseResponse, Record, SecondOrderModel
@@ -86,6 +87,7 @@ def identification(samples: int = 4000) -> Identification:
         cbsi=dataclasses.replace(matrices, diagnostics=diagnostics),
         matrices=matrices,
         matrices_std=deviation,
+        elements=None,
         identified=chain(1.001),
         predictions=(jnp.asarray(clean),),
         train_nrmse=jnp.asarray(rest * [1.0, 1.3, 3.1]),
@@ -115,6 +117,20 @@ def acceleration_response(model: SecondOrderModel, f: np.ndarray, factor: float)
     s = 2j * np.pi * f[:, None, None]
     mass, damping, stiffness = (np.asarray(x) for x in (model.mass, model.damping, model.stiffness))
     return (s**2 * np.linalg.inv(s**2 * mass + s * damping + factor * stiffness))[:, :, 0]
+
+
+def with_elements(found: Identification) -> Identification:
+    """The same where the values of the model's elements explain the records; one damper is not determined."""
+    unknowns = element_matrices(found.nominal)
+    nominal = jnp.asarray(unknowns.nominal)
+    values = ElementValues(
+        unknowns.listed,
+        1.02 * nominal,
+        (0.004 * nominal).at[3].set(jnp.inf),
+        jnp.eye(len(nominal)),
+        nominal,
+    )
+    return dataclasses.replace(found, elements=values)
 
 
 def without_matrices(found: Identification) -> Identification:

@@ -11,6 +11,7 @@ from band_limited import DT, THREE, chain, error, experiment
 from typer.testing import CliRunner
 
 from jaxsid.cli import app
+from jaxsid.files.model_toml import read_model
 
 SYSTEM = chain(*THREE)
 MODEL = """name = "three masses"
@@ -145,7 +146,7 @@ def test_quiet_says_nothing(files):
 def test_fewer_sensors_than_bodies_still_identify_with_a_warning(files, columns):
     model, _, out = files
     record = write_csv(out.parent / "two.csv", {n: x for n, x in columns.items() if n != "s3"})
-    result = call("identify", model, record, "--out", out)
+    result = call("identify", model, record, "--out", out, "--structure", "free")
     assert result.exit_code == 0, result.output
     found = identified(out)
     assert found["mass"] is None
@@ -155,10 +156,25 @@ def test_fewer_sensors_than_bodies_still_identify_with_a_warning(files, columns)
     assert not (out / "model.toml").exists()
 
 
+def test_the_structure_of_the_model_makes_up_for_sensors(files, columns):
+    model, _, out = files
+    record = write_csv(out.parent / "two.csv", {n: x for n, x in columns.items() if n != "s3"})
+    result = call("identify", model, record, "--out", out)
+    assert result.exit_code == 0, result.output
+    found = identified(out)
+    assert len(found["mass"]) == 3
+    assert any("follow from the model's structure" in w for w in found["warnings"])
+    values = {x["name"]: x["value"] for x in found["elements"]}
+    model = read_model(out / "model.toml")
+    assert values["b3.mass"] == float(model.mass[2])
+    assert {x["quantity"] for x in found["elements"]} == {"mass", "damping", "stiffness"}
+    assert all(x["std"] < abs(x["value"]) for x in found["elements"])
+
+
 def test_no_input_on_a_sensed_body(files, columns):
     model, _, out = files
     record = write_csv(out.parent / "two.csv", {n: x for n, x in columns.items() if n != "s1"})
-    result = call("identify", model, record, "--out", out)
+    result = call("identify", model, record, "--out", out, "--structure", "free")
     assert result.exit_code == 0, result.output
     assert any("No input acts on a sensed body" in w for w in identified(out)["warnings"])
 

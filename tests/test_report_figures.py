@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from report_fixture import chain, identification, without_matrices
+from report_fixture import chain, identification, with_elements, without_matrices
 
 from jaxsid.checks import InputError
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Sensor, lumped_model, second_order
 from jaxsid.modes import modal
 from jaxsid.report import plots
+from jaxsid.report.findings import BY_ELEMENTS, matrices_section
+from jaxsid.report.frame import Table, Text
 from jaxsid.report.modes import connecting, displacement_shapes, modes_of
 
 FIGURES = {
@@ -152,6 +154,21 @@ def test_many_sensors_and_real_poles():
     assert [mode.real for mode in modes_of(found)] == [True, False]
     assert "real" in plots.mode_shape_figure(found).axes[0].get_title(loc="left")
     assert plots.pole_figure(found).axes
+
+
+def test_fitted_elements_are_shown_with_what_is_known_of_them(found):
+    shown = matrices_section(with_elements(found))
+    assert shown.blocks[0] == Text(BY_ELEMENTS)
+    table = next(b for b in shown.blocks if isinstance(b, Table))
+    assert [row[0] for row in table.rows] == [
+        *found.nominal.bodies,
+        *(c.name for c in found.nominal.connections),
+    ]
+    assert "Read off the matrices" not in table.note
+    first, damped = table.rows[0], table.rows[len(found.nominal.bodies)]
+    assert "±" in first[1]
+    assert "±" not in damped[3]  # its deviation is infinite
+    assert "+2.0 %" in first[2].small
 
 
 def test_elements_are_read_off_the_matrices(found):

@@ -10,7 +10,7 @@ from jaxsid.checks import is_concrete, require, require_finite
 from jaxsid.impulse.spectra import FrequencyResponse
 from jaxsid.mechanics.hold import check_holds
 from jaxsid.physical.terms import FrequencyTerm, ResponseTerm
-from jaxsid.records import ImpulseResponse, SecondOrderModel
+from jaxsid.records import ImpulseResponse, SecondOrderModel, as_array
 
 HELD_OUT = 4  # every fourth sample or line is kept for validation
 FAINT = 1e-3  # noise next to a channel's rms that counts as none: weights stay finite
@@ -77,13 +77,14 @@ def response_weights(ir: ImpulseResponse, noise: object | None, left: Array | No
         variance = jnp.broadcast_to(level[:, None] ** 2, shape)
         return Weights(_inverse_root(variance, ir.h), None)
     if hasattr(noise, "autocovariance"):
-        c = jnp.asarray(noise.autocovariance)  # type: ignore[attr-defined]
-        lag = jnp.abs(jnp.arange(shape[0])[:, None] - jnp.arange(shape[0]))
-        padded = jnp.zeros((shape[0], shape[1])).at[: min(len(c), shape[0])].set(c[: shape[0]])
-        toeplitz = jnp.moveaxis(padded[lag], 2, 0) / padded[0][:, None, None]
-        lower = jnp.linalg.cholesky(toeplitz + 1e-10 * jnp.eye(shape[0]))
-        inverse = jnp.linalg.inv(lower)
-        return Weights(_inverse_root(jnp.broadcast_to(padded[0][:, None], shape), ir.h), inverse)
+        # numpy: made once, also where the response is traced and threads would wait for each other in LAPACK
+        c = np.asarray(noise.autocovariance)[: shape[0]]  # type: ignore[attr-defined]
+        c = np.pad(c, ((0, shape[0] - len(c)), (0, 0)))
+        lag = np.abs(np.arange(shape[0])[:, None] - np.arange(shape[0]))
+        lower = np.linalg.cholesky(np.moveaxis(c[lag] / c[0], 2, 0) + 1e-10 * np.eye(shape[0]))
+        inverse = np.tril(np.linalg.inv(lower))
+        variance = jnp.broadcast_to(jnp.asarray(c[0])[:, None], shape)
+        return Weights(_inverse_root(variance, ir.h), as_array(inverse))
     if hasattr(noise, "factor"):
         return Weights(_inverse_root((noise.factor**2).sum(axis=0), ir.h), None)  # type: ignore[attr-defined]
     variance = jnp.broadcast_to(noise.variance, shape)  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsid.compilation import compiled
-from jaxsid.least_squares import levenberg_marquardt
+from jaxsid.least_squares import levenberg_marquardt, sums_of
 from jaxsid.physical.elements import LinearMatrices
 from jaxsid.physical.parameterization import Parameterization
 from jaxsid.physical.restrictions import Prior, Restricted
@@ -57,19 +57,12 @@ class _Sums(NamedTuple):
     gradient: Array
 
 
-def _equations(
-    terms: tuple[Term, ...], parameterization: Parameterization, theta: Array
-) -> tuple[Array, Float[Array, "equations p"]]:
-    """Residual and Jacobian of all data."""
+def _sums(terms: tuple[Term, ...], parameterization: Parameterization, theta: Array) -> _Sums:
     matrices = parameterization.matrices(theta)
     M, D, K = (jnp.moveaxis(x, -1, 0) for x in jax.jacfwd(parameterization.matrices)(theta))
-    residuals, jacobians = zip(*(term.evaluate(matrices, (M, D, K)) for term in terms), strict=True)
-    return jnp.concatenate(residuals), jnp.concatenate(jacobians)
-
-
-def _sums(terms: tuple[Term, ...], parameterization: Parameterization, theta: Array) -> _Sums:
-    r, j = _equations(terms, parameterization, theta)
-    return _Sums(r @ r, j.T @ j, j.T @ r)
+    parts = [sums_of(*term.evaluate(matrices, (M, D, K))) for term in terms]
+    cost, product, gradient = (jnp.stack(x).sum(axis=0) for x in zip(*parts, strict=True))
+    return _Sums(2 * cost, product, gradient)
 
 
 def _with_prior(sums: _Sums, prior: Prior, theta: Array) -> tuple[Array, Array, Array]:
@@ -97,9 +90,9 @@ def most_probable(
     if solver is not None:
         return _by_optimistix(terms, parameterization, prior, start, solver)
 
-    def evaluate(theta: Array) -> tuple[Array, Array]:
-        data, known = _equations(terms, parameterization, theta), prior.rows(theta)
-        return jnp.concatenate([data[0], known[0]]), jnp.concatenate([data[1], known[1]])
+    def evaluate(theta: Array) -> tuple[Array, Array, Array]:
+        squares, product, gradient = _with_prior(_sums(terms, parameterization, theta), prior, theta)
+        return 0.5 * squares, product, gradient
 
     found = levenberg_marquardt(evaluate, start, max_steps=STEPS, tolerance=GAIN)
     r, j = prior.rows(found.value)
