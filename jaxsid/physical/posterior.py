@@ -23,6 +23,7 @@ from jaxsid.physical.terms import Term
 STEPS = 100
 SEARCHES = 80  # of the bounded quasi-Newton method, which only finds out which bounds hold
 GAIN = 1e-8  # part of the sum of squares that a last step may still bring
+ROUNDS = 8  # of changing which bounds hold
 NEAR = 1e-7  # of an unknown's scale: closer to a bound it lies on it
 Solver = optimistix.AbstractLeastSquaresSolver
 
@@ -205,8 +206,9 @@ class BoundedFit(NamedTuple):
 def within_bounds(terms: tuple[Term, ...], known: Restricted, start: Array) -> BoundedFit:
     """The mode of the posterior within the bounds, exact for those that hold: an active-set method.
 
-    Where the free mode lies outside, a bounded search says which bounds hold; the others are then fitted exactly,
-    bounds that are met on the way are added, those that pull inwards released.
+    Where the free mode lies outside, what it exceeds is held at the bounds and the rest fitted anew; bounds that are
+    met on the way are added, those from which the posterior pulls inwards released. Where that does not come to an
+    end a bounded search says which hold.
 
     Args:
         terms: the data.
@@ -217,28 +219,42 @@ def within_bounds(terms: tuple[Term, ...], known: Restricted, start: Array) -> B
     lower, upper = known.lower / scale, known.upper / scale
     found = most_probable(terms, free, known.prior, jnp.asarray(np.clip(np.asarray(start), lower, upper)))
     at = np.asarray(found.theta)
-    if not np.isfinite(at).all() or bool(((at >= lower) & (at <= upper)).all()):
+    outside = (at < lower) | (at > upper)
+    if not np.isfinite(at).all() or not outside.any():
         return BoundedFit(found, free, np.zeros(len(at), bool))
-    at = np.asarray(
-        _bounded(terms, free, known.prior, *map(jnp.asarray, (np.clip(at, lower, upper), lower, upper)))
-    )
-    held = (at - lower < NEAR) | (upper - at < NEAR)
-    for _ in range(2 * len(at)):
+    fit, settled = _with_active_bounds(terms, known, at, outside)
+    if settled:
+        return fit
+    at = np.clip(at, lower, upper)
+    at = np.asarray(_bounded(terms, free, known.prior, *(jnp.asarray(x) for x in (at, lower, upper))))
+    searched, settled = _with_active_bounds(terms, known, at, (at - lower < NEAR) | (upper - at < NEAR))
+    return searched if settled or searched.posterior.squares < fit.posterior.squares else fit
+
+
+def _with_active_bounds(
+    terms: tuple[Term, ...], known: Restricted, start: np.ndarray, held: np.ndarray
+) -> tuple[BoundedFit, bool]:
+    """The mode with some unknowns at their bounds, these changed until all pull outwards; whether they were."""
+    free, scale = known.unknowns, np.asarray(known.unknowns.scale)
+    lower, upper, at = known.lower / scale, known.upper / scale, start
+    for _ in range(ROUNDS):
         at = np.clip(at, lower, upper)
         unknowns = free.held(held, at * scale)
-        quiet = Prior(known.prior.mean, np.where(held, 0.0, np.asarray(known.prior.weight)))
-        found = most_probable(terms, unknowns, quiet, jnp.asarray(at))
+        weight = np.where(held, 0.0, np.asarray(known.prior.weight))
+        found = most_probable(terms, unknowns, Prior(known.prior.mean, weight), jnp.asarray(at))
         at = np.where(held, at, np.asarray(found.theta))
+        fit = BoundedFit(found._replace(theta=jnp.asarray(at)), unknowns, held)
         outside = (at < lower) | (at > upper)
         if outside.any():
-            held |= outside
+            held = held | outside
             continue
         pull = np.asarray(gradient_at(terms, free, known.prior, jnp.asarray(at)))
         released = held & np.where(at - lower < upper - at, pull < 0, pull > 0)
         if not released.any():
-            break
-        held &= ~released
-    return BoundedFit(found._replace(theta=jnp.asarray(at)), unknowns, held)
+            return fit, True
+        held = held & ~released
+    last = found._replace(theta=jnp.asarray(np.clip(at, lower, upper)), converged=jnp.asarray(False))
+    return BoundedFit(last, unknowns, held), False
 
 
 @compiled

@@ -38,9 +38,9 @@ def identify(
     """Impulse response, state-space model, modes and M, D, K of a system, from records of its inputs and outputs.
 
     M q'' + D q' + K q = B u, from Y(k) = G(z_k) U(k) + transient on the lines k that the inputs excite: observer
-    Markov parameters, ERA or ERA/DC, maximum-likelihood poles, CBSI, and the symmetric M, D, K that fit the
-    lines best. The model's numbers are compared with, never weighed; where CBSI fails they are a starting
-    point.
+    Markov parameters, ERA or ERA/DC, maximum-likelihood poles, CBSI, and the M, D, K that fit the lines best, made of
+    the model's own elements or free symmetric ones. The model's numbers are compared with, never weighed; where CBSI
+    fails they are a starting point.
 
     Args:
         model: bodies, connections, inputs and sensors; SI units.

@@ -16,6 +16,7 @@ from jaxsid.physical.elements import (
     element_values,
     with_values,
 )
+from jaxsid.physical.parameterization import BLIND
 from jaxsid.physical.posterior import BoundedFit, squares_at, within_bounds
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.physical.terms import ResponseTerm, Term
@@ -24,6 +25,7 @@ from jaxsid.records import as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 from jaxsid.uncertainty.noise import CorrelatedNoise, ResponseNoise
 
+FAINT = 0.01  # part of a combination, next to its largest, that is not named
 Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
 
 
@@ -132,17 +134,16 @@ def _weighted_rows(term: ResponseTerm, unknowns: LinearMatrices, theta: Array) -
 def _open(unknowns: LinearMatrices, information: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
     """Combinations of unknowns of which nothing is known, each as a sum of changes relative to their sizes."""
     root = np.sqrt(np.diag(information))
-    values, vectors = np.linalg.eigh(
-        information / np.where(root > 0, root, 1.0) / np.where(root > 0, root, 1.0)[:, None]
-    )
+    free = (root > 0) & np.asarray(unknowns.mix).any(axis=0)
+    if not free.any():
+        return ()
+    root, names = root[free], tuple(np.array(names)[free].tolist())
+    values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / root / root[:, None])
     found = []
-    for vector in vectors[:, (values < 1e-10 * values[-1])].T:
-        parts = vector / np.where(root > 0, root, 1.0)
-        parts = np.where(np.asarray(unknowns.mix).any(axis=0) & (root > 0), parts, 0.0)
-        if not parts.any():
-            continue
-        parts = parts / np.abs(parts).max()
-        kept = np.flatnonzero(np.abs(parts) > 0.01)
+    for vector in vectors[:, values < BLIND * values[-1]].T:
+        parts = vector / root
+        parts = parts / parts[np.abs(parts).argmax()]
+        kept = np.flatnonzero(np.abs(parts) > FAINT)
         found.append(" ".join(f"{parts[i]:+.2g} {names[i]}" for i in kept.tolist()))
     return tuple(found)
 

@@ -244,8 +244,10 @@ def method_section(found: Identification) -> Section:
         "and gives a state-space model; the eigenvalues are the poles, the eigenvectors seen by the "
         "sensors the mode shapes. Where sensors and inputs allow it, common-basis structural "
         "identification (CBSI) turns the model into mass, damping and stiffness, which a least-squares "
-        "fit to the records then refines with symmetric matrices. Standard deviations follow from the "
-        "noise of the records, to first order. The nominal model is compared with, and is no prior."
+        "fit to the records then refines: with the values of the nominal model's own masses, springs and "
+        "dampers unless the records contradict that structure, else with free symmetric matrices. "
+        "Standard deviations follow from the noise of the records, to first order. The numbers of the "
+        "nominal model are compared with, and are no prior."
     )
     return Section("How it was computed", (Text(words), Links(REFERENCES)))
 

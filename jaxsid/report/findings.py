@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxsid.identification import Identification
-from jaxsid.mechanics.lumped import second_order
+from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.physical.elements import ElementValues
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
 from jaxsid.report.modes import Mode, connecting, modes_of, worst_fits
@@ -169,7 +169,7 @@ def _beside(value: float, nominal: float) -> str:
 def _elements(found: Identification) -> Table | None:
     """Bodies and connections one by one: as fitted, or else read off the matrices of a model made of them."""
     if found.elements is not None:
-        return elements_table(found.elements, units_of(found.nominal))
+        return elements_table(found.elements, found.nominal)
     model = found.nominal
     if found.matrices is None or model.matrices is not None:
         return None
@@ -200,13 +200,14 @@ def _element_title(units: Units) -> str:
     return f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
 
 
-def elements_table(elements: ElementValues, units: Units) -> Table:
+def elements_table(elements: ElementValues, model: LumpedModel) -> Table:
     """Fitted values of bodies and connections with standard deviations, beside the nominal ones.
 
     Args:
         elements: the values.
-        units: of the model.
+        model: nominal, whose elements they are.
     """
+    units = units_of(model)
     cells = {
         (unknown.element, unknown.quantity): _beside_nominal(float(value), float(std), float(nominal))
         for unknown, value, std, nominal in zip(
@@ -214,9 +215,17 @@ def elements_table(elements: ElementValues, units: Units) -> Table:
         )
     }
     nothing = ("", "")
+    between = {c.name: f" {MISSING} ".join(c.between) for c in model.connections}
     bodies = [(e, *cells[e, q], *nothing) for e, q in cells if q == "mass"]
     joints = dict.fromkeys(e for e, q in cells if q != "mass")
-    rows = [(e, *cells.get((e, "stiffness"), nothing), *cells.get((e, "damping"), nothing)) for e in joints]
+    rows = [
+        (
+            Cell(e, between.get(e, "")),
+            *cells.get((e, "stiffness"), nothing),
+            *cells.get((e, "damping"), nothing),
+        )
+        for e in joints
+    ]
     note = "± one standard deviation. Below each nominal value: the change from it."
     return Table(_element_header(units), (*bodies, *rows), _element_title(units), note)
 
