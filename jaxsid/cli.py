@@ -3,11 +3,14 @@
 import atexit
 import gc
 import os
+import signal
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -193,18 +196,23 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """How noise, sensors and settings spread what is identified: thousands of realizations of many cases."""
-    with _errors(), _resumable(out), _study_view(quiet) as view:
+    with _errors(), _resumable(out) as heed, _study_view(quiet) as view:
         view.say("loading")
         _numerics(hurry=False)
         from jaxsid.report.study_html import write_study_report
         from jaxsid.study.configuration import read_study
-        from jaxsid.study.engine import run_study
+        from jaxsid.study.engine import Progress, run_study
         from jaxsid.study.store import open_store
         from jaxsid.study.tables import write_tables
 
         plan = read_study(file)
         with open_store(out, plan) as store, _workers(workers, scheduler) as execute:
-            run_study(plan, store, execute=execute, progress=view.progress, say=view.say)
+
+            def progress(at: Progress) -> None:
+                view.progress(at)
+                heed()
+
+            run_study(plan, store, execute=execute, progress=progress, say=view.say)
             view.say("tables and report")
             rows = write_tables(plan, store)
             write_study_report(plan, rows, store / "report.html")
@@ -240,15 +248,31 @@ def _workers(count: int | None, scheduler: str | None):
 
 
 @contextmanager
-def _resumable(out: Path) -> Iterator[None]:
-    """An interrupt is no failure: what is done is kept."""
+def _resumable(out: Path) -> Iterator[Callable[[], None]]:
+    """An interrupt is no failure: what is done is kept. Yields what raises it again should a library swallow it."""
+    asked = []
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    def heed() -> None:
+        if asked:
+            raise KeyboardInterrupt
+
+    mine = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, hear) if mine else None
     try:
-        yield
+        yield heed
+        heed()
     except KeyboardInterrupt:
         typer.echo(
             f"jaxsid: stopped. What was done is kept in {out}; the same command goes on from there.", err=True
         )
         raise typer.Exit(130) from None
+    finally:
+        if mine:
+            signal.signal(signal.SIGINT, before)
 
 
 def _numerics(*, hurry: bool = True) -> None:
