@@ -44,7 +44,9 @@ def test_nominal_values_make_the_matrices_of_the_model(model):
     theta = unknowns.of_values(jnp.asarray(unknowns.nominal))
     for made, given in zip(unknowns.matrices(theta), triple(model), strict=True):
         np.testing.assert_allclose(made, given, atol=1e-12)
-    for made, given in zip(triple(with_values(model, jnp.asarray(unknowns.nominal))), triple(model), strict=True):
+    for made, given in zip(
+        triple(with_values(model, jnp.asarray(unknowns.nominal))), triple(model), strict=True
+    ):
         np.testing.assert_allclose(made, given, atol=1e-12)
 
 

@@ -64,6 +64,7 @@ def test_a_spring_that_the_model_lacks_shows_in_free_matrices():
     assert abs(missing + 60.0) < 4 * deviation < 30
     told = identify(MODEL, record, structure="model")
     assert told.elements is not None
+    assert any("which was asked for" in w for w in told.warnings)
     assert float(told.matrices.stiffness[0, 2]) == 0.0
 
 

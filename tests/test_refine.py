@@ -86,9 +86,13 @@ def test_coloured_noise_that_is_known_is_weighed_and_covered():
         for k in range(1, len(h)):
             e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.81) * white[k]
         ir = ImpulseResponse(h + e * SIZE[:, None], EXACT.dt)
-        sample.append(pulls(refine(wrong(seed), ir, noise=noise)))
+        found = refine(wrong(seed), ir, noise=noise)
+        sample.append((pulls(found), np.asarray(found.elements.values) / TRUTH - 1))
         plain.append(np.asarray(refine(wrong(seed), ir).elements.values) / TRUTH - 1)
-    assert 0.8 < np.sqrt(np.square(sample).mean()) < 1.2
+    pull, weighed = np.moveaxis(np.array(sample), 1, 0)
+    assert 0.8 < np.sqrt(np.square(pull).mean()) < 1.2
+    # knowing the colour pays, for the masses above all
+    assert np.sqrt(np.square(weighed).mean(axis=0))[0] < 0.7 * np.sqrt(np.square(plain).mean(axis=0))[0]
 
 
 def test_noise_known_from_repeats_widens_the_deviations_as_it_must():

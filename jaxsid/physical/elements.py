@@ -129,6 +129,17 @@ def element_matrices(model: LumpedModel) -> LinearMatrices:
     )
 
 
+def unit_diagonal(information: Float[np.ndarray, "p p"]) -> tuple[np.ndarray, np.ndarray]:
+    """Information in units in which its diagonal is one, and these, (p,), 1 where there is none.
+
+    Args:
+        information: J'J.
+    """
+    root = np.sqrt(np.diag(information))
+    safe = np.where(root > 0, root, 1.0)
+    return information / safe / safe[:, None], safe
+
+
 def blind_elements(unknowns: LinearMatrices, information: Float[np.ndarray, "p p"]) -> np.ndarray:
     """(e,) which elements are part of a combination of unknowns of which nothing is known.
 
@@ -136,11 +147,10 @@ def blind_elements(unknowns: LinearMatrices, information: Float[np.ndarray, "p p
         unknowns: those of the fit.
         information: inverse of their covariance, singular where nothing is known.
     """
-    root = np.sqrt(np.diag(information))
-    safe = np.where(root > 0, root, 1.0)
-    values, vectors = np.linalg.eigh(information / safe / safe[:, None])
+    scaled, _ = unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled)
     lost = np.linalg.norm(vectors[:, values < BLIND * values[-1]], axis=1)
-    return (np.asarray(unknowns.mix) != 0) @ ((lost > TRACE) | (root == 0))
+    return (np.asarray(unknowns.mix) != 0) @ ((lost > TRACE) | (np.diag(information) == 0))
 
 
 def element_values(

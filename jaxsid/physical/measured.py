@@ -13,7 +13,6 @@ from jaxsid.physical.terms import FrequencyTerm, ResponseTerm
 from jaxsid.records import ImpulseResponse, SecondOrderModel, as_array
 
 HELD_OUT = 4  # every fourth sample or line is kept for validation
-FAINT = 1e-3  # noise next to a channel's rms that counts as none: weights stay finite
 
 
 class Weights(NamedTuple):
@@ -34,6 +33,7 @@ def response_term(
         weights: from `response_weights`.
         used: (samples,) of bool, those that count; all where None.
     """
+    # a part of the samples is weighed as if its noise were white, which costs that fit precision but no truth
     weight = weights.weight if used is None else weights.weight * jnp.asarray(used)[:, None, None]
     ramps = tuple(h == "first" for h in ir.hold)
     return ResponseTerm(ir.h, weight, weights.whitener if used is None else None, ir.dt, sensed, ramps)
@@ -64,12 +64,12 @@ def check_response(ir: ImpulseResponse, outputs: int, inputs: int) -> None:
 
 
 def response_weights(ir: ImpulseResponse, noise: object | None, left: Array | None = None) -> Weights:
-    """Weights from what is known of the noise: its model, else the response's own estimate, else what a fit left.
+    """Weights from what is known of the noise: its model, else the rms of what a fit left, or of the response itself.
 
     Args:
         ir: the response.
         noise: `IndependentNoise`, `StationaryNoise` or `CorrelatedNoise`; None where nothing is known.
-        left: (samples, outputs, inputs) of a fit without weights.
+        left: (samples, outputs, inputs) of a first fit; None before that.
     """
     shape = ir.h.shape
     if noise is None:

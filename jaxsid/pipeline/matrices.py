@@ -59,7 +59,10 @@ def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, struct
     structured, trouble = _cbsi(system, space)
     elements, free = _elements_and_free(model, system, space, target, sensed, structured, structure)
     if elements is not None:
-        notes = (*trouble, *_notes(elements.fit, structured))
+        # a free fit was made because the elements were doubted: asked for, they are given, but not in silence
+        doubted = free is not None and not as_good(elements.fit, free)
+        forced = (_forced(elements.fit, free),) if doubted and free is not None else ()
+        notes = (*trouble, *_notes(elements.fit, structured), *forced)
         return _found(sensed, structured, elements.fit, fitted_values(elements), notes)
     contradicted = () if structure == "free" or free is None else (_contradicted(free),)
     fit, held = _positive_fit(system, space, target, sensed, free)
@@ -144,6 +147,14 @@ def _by_elements_alone(
     bare = ", ".join(b for i, b in enumerate(model.bodies) if i not in system.places)
     note = f"No sensor on {bare}: mass, damping and stiffness there follow from the model's structure."
     return _found(sensed, None, elements.fit, fitted_values(elements), (note, *_notes(elements.fit, None)))
+
+
+def _forced(elements: MatrixFit, free: MatrixFit) -> str:
+    return (
+        "The records contradict the structure of the model, which was asked for: its elements leave "
+        f"{float(elements.misfit):.4g} times the noise, free symmetric matrices {float(free.misfit):.4g}. The standard "
+        "deviations do not cover that."
+    )
 
 
 def _contradicted(free: MatrixFit) -> str:

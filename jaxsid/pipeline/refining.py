@@ -14,6 +14,7 @@ from jaxsid.physical.elements import (
     LinearMatrices,
     blind_elements,
     element_values,
+    unit_diagonal,
     with_values,
 )
 from jaxsid.physical.parameterization import BLIND
@@ -109,9 +110,8 @@ def _uncertainty(problem: Problem, fit: BoundedFit, noise: ResponseNoise | None)
 
 def _inverse(information: np.ndarray) -> np.ndarray:
     """Inverse where there is one: combinations of which nothing is known are left out."""
-    root = np.sqrt(np.diag(information))
-    safe = np.where(root > 0, root, 1.0)
-    values, vectors = np.linalg.eigh(information / safe / safe[:, None])
+    scaled, safe = unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled)
     seen = values > 1e-14 * values[-1]
     return (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / safe / safe[:, None]
 
@@ -133,12 +133,12 @@ def _weighted_rows(term: ResponseTerm, unknowns: LinearMatrices, theta: Array) -
 
 def _open(unknowns: LinearMatrices, information: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
     """Combinations of unknowns of which nothing is known, each as a sum of changes relative to their sizes."""
-    root = np.sqrt(np.diag(information))
-    free = (root > 0) & np.asarray(unknowns.mix).any(axis=0)
+    free = (np.diag(information) > 0) & np.asarray(unknowns.mix).any(axis=0)
     if not free.any():
         return ()
-    root, names = root[free], tuple(np.array(names)[free].tolist())
-    values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / root / root[:, None])
+    names = tuple(np.array(names)[free].tolist())
+    scaled, root = unit_diagonal(information[np.ix_(free, free)])
+    values, vectors = np.linalg.eigh(scaled)
     found = []
     for vector in vectors[:, values < BLIND * values[-1]].T:
         parts = vector / root

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -12,6 +13,7 @@ from jaxsid.physical.elements import (
     blind_elements,
     element_matrices,
     element_values,
+    unit_diagonal,
 )
 from jaxsid.physical.inband_fit import MatrixFit, Target, fit_matrices
 from jaxsid.physical.parameterization import BLIND, Triple
@@ -73,22 +75,16 @@ def as_good(elements: MatrixFit, free: MatrixFit) -> bool:
         elements: the fit with fewer unknowns.
         free: the one with more, which says what noise is.
     """
-    return _by_chance(elements.squares - free.squares, free.unknowns.size, elements)
+    growth = (elements.squares - free.squares) / jnp.maximum(free.misfit, 1.0)
+    return _by_chance(growth, free.unknowns.size, elements)
 
 
 def _by_chance(growth: Array | float, unknowns: Array | int, elements: MatrixFit) -> bool:
     """Chi-squared at 1 % by the cube root of E. B. Wilson and M. M. Hilferty, PNAS 17 (1931)."""
-    fewer = max(int(unknowns) - np.linalg.matrix_rank(_scaled(elements)[0], tol=BLIND), 1)
+    scaled, _ = unit_diagonal(np.asarray(elements.information))
+    fewer = max(int(unknowns) - np.linalg.matrix_rank(scaled, tol=BLIND), 1)
     ninth = 2 / (9 * fewer)
     return bool(float(growth) < fewer * (1 - ninth + CHANCE * np.sqrt(ninth)) ** 3)
-
-
-def _scaled(fit: MatrixFit) -> tuple[np.ndarray, np.ndarray]:
-    """Information with a diagonal of ones, and its roots before."""
-    information = np.asarray(fit.information)
-    root = np.sqrt(np.diag(information))
-    safe = np.where(root > 0, root, 1.0)
-    return information / safe / safe[:, None], root
 
 
 def undetermined(found: ElementFit) -> np.ndarray:

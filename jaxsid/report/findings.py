@@ -18,9 +18,8 @@ NO_MATRICES = (
 )
 FREE = "Symmetric matrices that fit the records best, in the order of the bodies."
 BY_ELEMENTS = (
-    "Made of the model's own masses, springs and dampers, whose values were fitted to the records. Free symmetric "
-    "matrices would fit no better than chance allows (chi-squared test at 1 %), so that entries which the model does "
-    "not have are zero."
+    "Made of the model's own masses, springs and dampers, whose values were fitted to the records; entries which the "
+    "model does not have are zero."
 )
 TABLED = 8  # larger matrices are shown as figures
 GOOD_FIT, POOR_FIT = 1.2, 3.0  # misfit over noise floor
