@@ -105,7 +105,11 @@ def models(draw):
         Effect(
             "periodic_disturbance",
             (("body", bodies[0]),),
-            {"phase": jnp.asarray(draw(st.lists(positive, min_size=1)))},
+            {
+                "amplitude": jnp.asarray(draw(positive)),
+                "frequency_hz": jnp.asarray(draw(positive)),
+                "phase": jnp.asarray(draw(st.lists(positive, min_size=1))),
+            },
         ),
         Effect("sensor_gain", (("sensor", names[-1]),), {"factor": jnp.asarray(draw(positive))}),
     ]

@@ -10,7 +10,7 @@ import scipy.signal
 from jaxsid.checks import InputError
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
-from jaxsid.mechanics.lumped import Connection, Effect, Input, Sensor, lumped_model, second_order
+from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model, second_order
 from jaxsid.mechanics.simulate import (
     estimate_initial_state,
     impulse_response_of,
@@ -226,9 +226,8 @@ def test_clear_errors():
     m = continuous_of(model)
     with pytest.raises(InputError, match="input 'fc' of the model is missing"):
         simulate(model, {"fa": u[:, 0], "fb": u[:, 1]}, dt=0.1)
-    effect = Effect("coulomb_friction", (("between", ("a", "b")),), {"force": jnp.asarray(1.0)})
-    with pytest.raises(InputError, match="models with effects"):
-        simulate(type(model)(**{**vars(model), "effects": (effect,)}), {"fa": u[:, 0]}, dt=0.1)
+    with pytest.raises(InputError, match="substeps must be at least 1"):
+        simulate(model, {"fa": u[:, 0]}, dt=0.1, substeps=0)
     with pytest.raises(InputError, match="initial 'guess' is unknown"):
         simulate(model, {"fa": u[:, 0]}, dt=0.1, initial="guess")
     with pytest.raises(InputError, match="none of the model's sensors"):

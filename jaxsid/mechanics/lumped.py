@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsid.checks import bad_input, is_concrete, require, require_finite
 from jaxsid.compilation import compiled
+from jaxsid.mechanics.effects.catalogue import check_effect
 from jaxsid.records import HOLDS, SENSOR_KINDS, SecondOrderModel, as_array, floating
 
 GROUND = "ground"
@@ -212,12 +213,14 @@ def _check_effects(model: LumpedModel) -> None:
     }
     for effect in model.effects:
         where = f"{model.name}, effect '{effect.kind}'"
-        for key, value in effect.place:
-            if key == "between":
-                _check_between(model, value, where)
-            else:
-                _known(key, ("between", *choices), where, "place")
-                _known(value, choices[key], where, key)
+        require(len(effect.place) == 1, f"{where}: it needs one place, not {len(effect.place)}.")
+        ((key, value),) = effect.place
+        if key == "between":
+            _check_between(model, value, where)
+        else:
+            _known(key, ("between", *choices), where, "place")
+            _known(value, choices[key], where, key)
+        check_effect(effect.kind, key, effect.parameters, where)
 
 
 def _check_elements(model: LumpedModel) -> None:

@@ -1,0 +1,132 @@
+"""All kinds of effects, found by their files, and the laws of several effects at once."""
+
+import difflib
+import pkgutil
+from collections.abc import Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxsid.checks import bad_input, is_concrete, require
+from jaxsid.mechanics import effects
+from jaxsid.mechanics.effects.kind import Changes, Kind, Motion, Nominal
+
+
+def _found() -> dict[str, Kind]:
+    names = sorted(module.name for module in pkgutil.iter_modules(effects.__path__))
+    modules = (import_module(f"{effects.__name__}.{n}") for n in names if n not in ("catalogue", "kind"))
+    return {module.EFFECT.name: module.EFFECT for module in modules}
+
+
+CATALOGUE: Mapping[str, Kind] = MappingProxyType(_found())
+MOST_PARAMETERS = max(len(kind.parameters) for kind in CATALOGUE.values())
+
+
+def kind_number(name: str) -> int:
+    """Position of a kind in the catalogue."""
+    return list(CATALOGUE).index(name)
+
+
+def check_effect(name: str, where: str, parameters: Mapping[str, ArrayLike], said: str) -> None:
+    """Raise InputError where an effect's kind, place or parameters cannot be.
+
+    Args:
+        name: of the kind.
+        where: "between", "body", "sensor" or "input".
+        parameters: given values by name, one number or one a record.
+        said: how to name the effect in a message.
+    """
+    if name not in CATALOGUE:
+        near = difflib.get_close_matches(name, CATALOGUE, 1)
+        hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(CATALOGUE)}."
+        bad_input(f"{said}: this kind of effect is unknown; {hint}")
+    kind = CATALOGUE[name]
+    require(where == kind.where, f"{said}: its place is '{kind.where}', not '{where}'.")
+    names = [p.name for p in kind.parameters]
+    for given in parameters:
+        require(given in names, f"{said}: it has no parameter '{given}'; choose from {', '.join(names)}.")
+    for p in kind.parameters:
+        require(
+            p.default is not None or p.name in parameters, f"{said}: its parameter '{p.name}' is missing."
+        )
+        value = jnp.asarray(parameters.get(p.name, p.default))
+        if is_concrete(value):
+            low = float(np.min(np.asarray(value)))
+            require(low >= p.lowest, f"{said}: '{p.name}' is {low:g}; it must be at least {p.lowest:g}.")
+    require(bool(parameters) or not names, f"{said}: give one of {', '.join(names)}.")
+
+
+def parameter_row(name: str, parameters: Mapping[str, ArrayLike], record: int) -> Float[Array, " most"]:
+    """The parameters of an effect in the order of its kind, padded to the most that any has.
+
+    Args:
+        name: of the kind.
+        parameters: one number or one a record each.
+        record: number of the record, for those that have one a record; the last where there are fewer.
+    """
+    row = []
+    for p in CATALOGUE[name].parameters:
+        value = jnp.ravel(jnp.asarray(parameters.get(p.name, p.default), dtype=float))
+        row.append(value[min(record, len(value) - 1)])
+    return jnp.stack([*row, *[jnp.zeros(())] * (MOST_PARAMETERS - len(row))])
+
+
+Numbers = Int[Array, " slots"] | Int[np.ndarray, " slots"]
+
+
+def _chosen(kind: Kind, kinds: Numbers, parameters: Array) -> tuple[Array, list[Array]]:
+    """Which slots are of a kind, and their parameters; typical ones for the others, whose results are dropped."""
+    here = jnp.asarray(kinds) == kind_number(kind.name)
+    return here, [jnp.where(here, parameters[:, i], p.typical) for i, p in enumerate(kind.parameters)]
+
+
+def _total(hook: str, kinds: Numbers, parameters: Array, seen: Any) -> Array:
+    total = jnp.zeros(len(parameters), parameters.dtype)
+    for kind in CATALOGUE.values():
+        law = getattr(kind, hook)
+        if law is not None:
+            here, values = _chosen(kind, kinds, parameters)
+            total = jnp.where(here, law(seen, *values), total)
+    return total
+
+
+def forces(kinds: Numbers, parameters: Float[Array, "slots most"], motion: Motion) -> Float[Array, " slots"]:
+    """Forces without jumps of every slot.
+
+    Args:
+        kinds: numbers of the kinds.
+        parameters: in their order.
+        motion: what each slot sees.
+    """
+    return _total("force", kinds, parameters, motion)
+
+
+def rates(kinds: Numbers, parameters: Float[Array, "slots most"], motion: Motion) -> Float[Array, " slots"]:
+    """Rates of the memories of every slot; arguments as of `forces`."""
+    return _total("rate", kinds, parameters, motion)
+
+
+def slips(kinds: Numbers, parameters: Float[Array, "slots most"], speed: Array) -> Float[Array, " slots"]:
+    """Magnitude of dry friction of every slot at a speed; arguments as of `forces`."""
+    return _total("slip", kinds, parameters, speed)
+
+
+def changes(kinds: Numbers, parameters: Float[Array, "slots most"], nominal: Nominal) -> Changes:
+    """What every slot changes in the linear model and in signals, each (slots,).
+
+    Args:
+        kinds: numbers of the kinds.
+        parameters: in their order.
+        nominal: what the model has at the place of each slot.
+    """
+    total = [jnp.zeros(len(parameters), parameters.dtype)] * len(Changes._fields)
+    for kind in CATALOGUE.values():
+        if kind.changes is not None:
+            here, values = _chosen(kind, kinds, parameters)
+            found = kind.changes(nominal, *values)
+            total = [jnp.where(here, x, t) for x, t in zip(found, total, strict=True)]
+    return Changes(*total)

@@ -1,0 +1,25 @@
+"""A force that repeats along the way."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import FORCE, Kind, Motion, Parameter
+
+
+def _force(at: Motion, amplitude: Array, wavenumber: Array, phase: Array) -> Array:
+    return amplitude * jnp.sin(wavenumber * at.displacement + phase)
+
+
+EFFECT = Kind(
+    name="cogging_ripple",
+    where="between",
+    parameters=(
+        Parameter("amplitude", FORCE),
+        Parameter("wavenumber", ("rad/m", "rad/rad")),
+        Parameter("phase", ("rad", "rad"), default=0.0),
+    ),
+    law="F = p sin(w d + phi)",
+    about="Magnets of a motor attract its teeth, balls of a guide pass its edge, teeth of a gear mesh.",
+    source="T. M. Jahns and W. L. Soong, IEEE Trans. Ind. Electron. 43 (1996).",
+    force=_force,
+)

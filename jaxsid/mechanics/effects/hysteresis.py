@@ -1,0 +1,32 @@
+"""A force that depends on the path: Bouc and Wen's law."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import NONE, STIFFNESS, Kind, Motion, Parameter, power
+
+
+def _force(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Array) -> Array:
+    return stiffness * at.memory
+
+
+def _rate(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Array) -> Array:
+    size = power(at.memory, exponent)
+    return at.velocity - (beta * jnp.abs(at.velocity) * jnp.sign(at.memory) + gamma * at.velocity) * size
+
+
+EFFECT = Kind(
+    name="hysteresis",
+    where="between",
+    parameters=(
+        Parameter("stiffness", STIFFNESS),
+        Parameter("beta", ("1/m^n", "1/rad^n")),
+        Parameter("gamma", ("1/m^n", "1/rad^n")),
+        Parameter("exponent", NONE, lowest=1.0, default=1.0),
+    ),
+    law="F = a z, z' = v - beta abs(v) abs(z)^(n-1) z - gamma v abs(z)^n",
+    about="Wire ropes, rubber, joints that slip a little: the force lags behind, as a loop of some width.",
+    source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976).",
+    force=_force,
+    rate=_rate,
+)

@@ -1,0 +1,20 @@
+"""A drive that acts late."""
+
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import TIME, Changes, Kind, Nominal, Parameter
+
+
+def _changes(at: Nominal, delay: Array) -> Changes:
+    return Changes(delay=delay)
+
+
+EFFECT = Kind(
+    name="input_delay",
+    where="input",
+    parameters=(Parameter("delay", TIME, lowest=0.0, typical=0.0),),
+    law="held input at t - delay",
+    about="Computing time and transmission between command and force.",
+    source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",
+    changes=_changes,
+)

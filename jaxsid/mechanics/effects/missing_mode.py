@@ -1,0 +1,24 @@
+"""A mass on a spring and damper that the model lacks."""
+
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import DAMPING, MASS, STIFFNESS, Changes, Kind, Nominal, Parameter
+
+
+def _changes(at: Nominal, mass: Array, stiffness: Array, damping: Array) -> Changes:
+    return Changes(attached_mass=mass, attached_stiffness=stiffness, attached_damping=damping)
+
+
+EFFECT = Kind(
+    name="missing_mode",
+    where="body",
+    parameters=(
+        Parameter("mass", MASS, lowest=0.0),
+        Parameter("stiffness", STIFFNESS, lowest=0.0),
+        Parameter("damping", DAMPING, lowest=0.0, default=0.0),
+    ),
+    law="m x'' + c (x' - x_b') + k (x - x_b) = 0, its spring and damper pulling at the body",
+    about="A flexible part that was taken for rigid: it adds a resonance and splits those near it.",
+    source="J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, ch. 3.",
+    changes=_changes,
+)

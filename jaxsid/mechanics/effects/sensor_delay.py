@@ -1,0 +1,20 @@
+"""A sensor that reports late."""
+
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import TIME, Changes, Kind, Nominal, Parameter
+
+
+def _changes(at: Nominal, delay: Array) -> Changes:
+    return Changes(delay=delay)
+
+
+EFFECT = Kind(
+    name="sensor_delay",
+    where="sensor",
+    parameters=(Parameter("delay", TIME, lowest=0.0, typical=0.0),),
+    law="output at t - delay",
+    about="Transmission, buffers, converters that read their channels one after another.",
+    source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",
+    changes=_changes,
+)

@@ -1,0 +1,25 @@
+"""Dry friction that falls with speed from a static level."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsid.mechanics.effects.kind import FORCE, SPEED, Kind, Parameter
+
+
+def _slip(speed: Array, force: Array, static_force: Array, velocity: Array) -> Array:
+    return force + (static_force - force) * jnp.exp(-((speed / velocity) ** 2))
+
+
+EFFECT = Kind(
+    name="stribeck_friction",
+    where="between",
+    parameters=(
+        Parameter("force", FORCE, lowest=0.0),
+        Parameter("static_force", FORCE, lowest=0.0),
+        Parameter("velocity", SPEED, lowest=0.0),
+    ),
+    law="F = (Fc + (Fs - Fc) exp(-(v/vs)^2)) sign(v), sticking at v = 0",
+    about="Lubricated contacts break loose at a static level and slide at a lower one, so that slow motion jerks.",
+    source="B. Armstrong-Helouvry, P. Dupont and C. Canudas de Wit, Automatica 30 (1994).",
+    slip=_slip,
+)

@@ -1,0 +1,202 @@
+"""Motion of a lumped model with effects: exact where linear, fourth order for forces, event by event for friction.
+
+Runge and Kutta's method with the matrix exponential (S. Cox and P. Matthews, J. Comput. Phys. 176, 2002, eq. 26-29), in
+which the laws' forces enter through few ports only; dry friction acts on top, with its mean over each step.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxsid.mechanics.augmented import Augmented
+from jaxsid.mechanics.dry_friction import friction, holding
+from jaxsid.mechanics.effects.catalogue import forces, rates, slips
+from jaxsid.mechanics.effects.kind import Motion
+from jaxsid.mechanics.functions_of_matrices import phi_functions
+from jaxsid.mechanics.held_input import Late, line_over_step
+from jaxsid.mechanics.slots import Slots
+
+
+class Path(NamedTuple):
+    """Motion at the sampling instants.
+
+    Attributes:
+        states: (samples, n).
+        sliding: (samples, slots) which way dry friction slides, 0 where it holds.
+        mean_force: (samples, ports) of every port over the sampling interval that begins there.
+    """
+
+    states: Float[Array, "samples n"]
+    sliding: Float[Array, "samples slots"]
+    mean_force: Float[Array, "samples ports"]
+
+
+class _Step(eqx.Module):
+    """Matrices of one step; everything that the linear part does is in the first product.
+
+    Attributes:
+        linear: (n + 9 slots, n + 2 inputs) from state and input's line: the state at the end, and what the laws see
+            at the start, in the middle and at the end, without forces.
+        middle, carried: (3 slots, ports) what forces of the first half do to what is seen in the middle, at the end.
+        weights: (n, 3 ports) of the forces at the start, of the two in the middle together, at the end.
+        rubs: (n, slots) what a mean force does to the state.
+    """
+
+    linear: Array
+    middle: Array
+    carried: Array
+    weights: Array
+    rubs: Array
+
+
+def phi_columns(A: Array, columns: Array, h: Array) -> tuple[Array, Array, Array, Array]:
+    """e^(A h), and h phi_k(A h) times columns for k = 1, 2, 3, all from one exponential.
+
+    Args:
+        A: (n, n).
+        columns: (n, count).
+        h: time, s.
+    """
+    n, count = columns.shape
+    top = jnp.concatenate([A * h, columns * h, jnp.zeros((n, 2 * count), A.dtype)], axis=1)
+    shift = jnp.eye(3 * count, n + 3 * count, n + count, dtype=A.dtype)
+    whole = jnp.concatenate([top, shift])
+    first, _ = phi_functions(whole)
+    found = jnp.eye(len(whole), dtype=A.dtype) + whole @ first
+    parts = (found[:n, n + k * count : n + (k + 1) * count] for k in range(3))
+    one, two, three = parts
+    return found[:n, :n], one, two, three
+
+
+def _step(system: Augmented, h: Array) -> _Step:
+    A, seen, ports, inputs = system.A, system.seen, system.G.shape[1], system.B.shape[1]
+    slots = ports // 2
+    columns = jnp.concatenate([system.G, system.B], axis=1)
+    whole, one, two, three = phi_columns(A, columns, h)
+    half, one_half, two_half, _ = phi_columns(A, columns, h / 2)
+    end = jnp.concatenate([whole, one[:, ports:], two[:, ports:]], axis=1)
+    # the change over the step acts by half over its first half
+    middle = jnp.concatenate([half, one_half[:, ports:], two_half[:, ports:] / 2], axis=1)
+    start = jnp.concatenate([seen, jnp.zeros((3 * slots, 2 * inputs), A.dtype)], axis=1)
+    G1, G2, G3 = (x[:, :ports] for x in (one, two, three))
+    first_half = one_half[:, :ports]
+    return _Step(
+        linear=jnp.concatenate([end, start, seen @ middle, seen @ end]),
+        middle=seen @ first_half,
+        carried=seen @ half @ first_half,
+        weights=jnp.concatenate([G1 - 3 * G2 + 4 * G3, 2 * G2 - 4 * G3, 4 * G3 - G2], axis=1),
+        rubs=G1[:, :slots],
+    )
+
+
+def _apply(matrix: Array, x: Array) -> Array:
+    """A product of few numbers, written so that it joins the loop's other arithmetic in one kernel."""
+    return (matrix * x).sum(axis=-1)
+
+
+def _ports(slots: Slots, spring: Array, seen: Array, time: Array) -> Array:
+    """Forces and rates of memory."""
+    d, v, z = jnp.split(seen, 3)
+    motion = Motion(d, v, z, time, spring)
+    found = (law(slots.kinds, slots.parameters, motion) for law in (forces, rates))
+    return jnp.concatenate(list(found))
+
+
+def integrate(
+    system: Augmented,
+    slots: Slots,
+    late: Late,
+    dt: Array,
+    state: Float[Array, " n"],
+    substeps: int | Array,
+) -> Path:
+    """Motion from a state at the first sample.
+
+    Args:
+        system: linear part and ports.
+        slots: the effects.
+        late: the inputs between samples.
+        dt: sampling interval, s.
+        state: to begin with.
+        substeps: steps for each sampling interval; a traced number costs reverse differentiation.
+    """
+    h = dt / substeps
+    step = _step(system, h)
+    n, count = len(system.A), slots.count
+    ports = 2 * count
+    speeds = system.seen[count : 2 * count]
+    rubs, give = step.rubs, -speeds @ step.rubs
+    law = partial(_ports, slots, system.spring)
+
+    def advance(i: Array, carry: tuple, of_sample: Late, number: Array) -> tuple:
+        x, sliding, total = carry
+        value, change = line_over_step(of_sample, i / substeps, 1 / jnp.asarray(substeps, x.dtype))
+        time = dt * (number + i / substeps)
+        free = _apply(step.linear, jnp.concatenate([x, value, change]))
+        ahead, w0, wm, w1 = jnp.split(free, [n, n + 3 * count, n + 6 * count])
+        f0 = law(w0, time)
+        fa = law(wm + _apply(step.middle, f0), time + h / 2)
+        fb = law(wm + _apply(step.middle, fa), time + h / 2)
+        late_half = _apply(step.middle, 2 * fb - f0)
+        f1 = law(w1 + _apply(step.carried, f0) + late_half, time + h)
+        x1 = ahead + _apply(step.weights, jnp.concatenate([f0, fa + fb, f1]))
+        contact = friction(
+            slots.kinds, slots.parameters, w0[count : 2 * count], sliding, _apply(speeds, x1), give
+        )
+        mean = (f0 + 2 * (fa + fb) + f1) / 6
+        mean = mean.at[:count].add(contact.force)
+        return x1 + _apply(rubs, contact.force), contact.sliding, total + mean / substeps
+
+    def sample(carry: tuple, given: tuple[Late, Array]) -> tuple[tuple, tuple]:
+        x, sliding = carry
+        begin = (x, sliding, jnp.zeros(ports, x.dtype))
+        step_of = partial(advance, of_sample=given[0], number=given[1])
+        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
+        return (x1, after), (x, sliding, mean)
+
+    arrival = jnp.broadcast_to(late.arrival, late.new.shape)
+    steps = late._replace(arrival=arrival), jnp.arange(len(late.new), dtype=state.dtype)
+    begin = _sliding_at(speeds, state)
+    _, (states, sliding, mean) = lax.scan(sample, (state, begin), steps)
+    return Path(states, sliding, mean)
+
+
+def _sliding_at(speeds: Array, state: Array) -> Array:
+    """Which way each place slides at first; a speed that is nothing but rounding is rest."""
+    size = 1e-12 * jnp.abs(speeds) @ jnp.abs(state)
+    relative = speeds @ state
+    return jnp.where(jnp.abs(relative) > size, jnp.sign(relative), 0.0)
+
+
+def instant_forces(
+    system: Augmented, slots: Slots, path: Path, u: Float[Array, "samples inputs"], dt: Array
+) -> Float[Array, "samples ports"]:
+    """Forces at the sampling instants, friction where it holds in balance with all others.
+
+    Args:
+        system: linear part and ports.
+        slots: the effects.
+        path: from `integrate`.
+        u: inputs at the sampling instants.
+        dt: sampling interval, s.
+    """
+    count = slots.count
+    speeds = system.seen[count : 2 * count]
+    give = -speeds @ system.G[:, :count]
+
+    def at(x: Array, sliding: Array, pushed: Array, number: Array) -> Array:
+        seen = system.seen @ x
+        speed = seen[count : 2 * count]
+        force = _ports(slots, system.spring, seen, dt * number)
+        rubs = sliding * slips(slots.kinds, slots.parameters, jnp.abs(speed))
+        force = force.at[:count].add(rubs)
+        gain = speeds @ (system.A @ x + system.B @ pushed + system.G @ force)
+        resting = jnp.where(sliding == 0, slots.kinds, -1)
+        return force.at[:count].add(holding(resting, slots.parameters, gain, give))
+
+    return jax.vmap(at)(path.states, path.sliding, u, jnp.arange(len(u), dtype=u.dtype))

@@ -1,0 +1,107 @@
+"""Outputs of a lumped model with effects, from inputs at samples to readings at samples."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsid.mechanics.augmented import Augmented, augmented
+from jaxsid.mechanics.held_input import Late, late_input, line_over_step, value_at_sample
+from jaxsid.mechanics.integrate import Path, instant_forces, integrate, phi_columns
+from jaxsid.mechanics.slots import Slots
+from jaxsid.records import SecondOrderModel
+
+
+class Response(NamedTuple):
+    """What a model with effects does.
+
+    Attributes:
+        outputs: (samples, outputs) readings of the sensors.
+        states: (samples, n) displacements, velocities, two states of each effect.
+        forces: (samples, slots) of each effect at the sampling instants.
+    """
+
+    outputs: Float[Array, "samples outputs"]
+    states: Float[Array, "samples n"]
+    forces: Float[Array, "samples slots"]
+
+
+def state_count(bodies: int, slots: int) -> int:
+    """Number of states of a model with so many bodies and effects."""
+    return 2 * (bodies + slots)
+
+
+def respond(
+    linear: SecondOrderModel,
+    slots: Slots,
+    u: Float[Array, "samples inputs"],
+    ramps: Bool[Array, " inputs"],
+    dt: Float[Array, ""],
+    state: Float[Array, " n"],
+    substeps: int | Array,
+) -> Response:
+    """Readings of a model with effects. An input is limited first, then scaled, delayed, made to lag; an output made to
+    lag first, then delayed, scaled, shifted.
+
+    Args:
+        linear: the model without effects.
+        slots: its effects.
+        u: inputs.
+        ramps: which are held to first order, the others to zero order.
+        dt: sampling interval, s.
+        state: at the first sample, as in `Response`.
+        substeps: steps for each sampling interval.
+    """
+    system = augmented(linear, slots)
+    change = system.changed
+    inverse = change.inverse_limit @ slots.inputs
+    limit = jnp.where(inverse > 0, 1 / jnp.where(inverse > 0, inverse, 1.0), jnp.inf)
+    pushed = jnp.clip(u, -limit, limit) * (1 + change.gain @ slots.inputs)
+    late = late_input(pushed, ramps, change.delay @ slots.inputs / dt)
+    path = integrate(system, slots, late, dt, state, substeps)
+    now = value_at_sample(late)
+    forces = instant_forces(system, slots, path, now, dt)
+    delays = change.delay @ slots.sensors / dt
+    read = jax.vmap(_delayed, (0, 0, 0, 0, None, None, None, None, None), 1)
+    outputs = read(system.C, system.D, system.F, delays, system, path, forces, late, dt)
+    outputs = outputs * (1 + change.gain @ slots.sensors) + change.offset @ slots.sensors
+    return Response(outputs, path.states, forces[:, : slots.count])
+
+
+def _delayed(
+    C: Array,
+    D: Array,
+    F: Array,
+    delay: Array,
+    system: Augmented,
+    path: Path,
+    forces: Array,
+    late: Late,
+    dt: Array,
+) -> Float[Array, " samples"]:
+    """One output some sampling intervals ago, from the sample before that instant; at rest before the record."""
+    back = jnp.ceil(delay)
+    part = back - delay
+    at = jnp.arange(len(forces)) - back.astype(int)
+    before = jnp.clip(at, 0, len(forces) - 1)
+    after = jnp.minimum(before + 1, len(forces) - 1)
+    columns = jnp.concatenate([system.G, system.B], axis=1)
+    ports = system.G.shape[1]
+    whole, one, two, _ = phi_columns(system.A, columns, part * dt)
+    length = jnp.where(part > 0, part, 1.0)
+    value, change = jax.vmap(lambda i: line_over_step(_of_sample(late, i), jnp.zeros_like(part), length))(
+        before
+    )
+    x = path.states[before] @ whole.T + path.mean_force[before] @ one[:, :ports].T
+    x = x + value @ one[:, ports:].T + change @ two[:, ports:].T
+    arrived = (part >= late.arrival)[None]
+    line = late.new + (part - late.arrival) * late.new_slope
+    u = jnp.where(arrived, line, late.old + (part - late.arrival) * late.old_slope)[before]
+    f = forces[before] * (1 - part) + forces[after] * part
+    return jnp.where(at < 0, C @ path.states[0], x @ C + u @ D + f @ F)
+
+
+def _of_sample(late: Late, number: Array) -> Late:
+    old, new, old_slope, new_slope = (x[number] for x in late[:4])
+    return Late(old, new, old_slope, new_slope, late.arrival)
