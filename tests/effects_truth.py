@@ -156,9 +156,14 @@ class Truth:
             self.x = solve_ivp(self.derivative, (t, end), self.x, args=(k, None), **options).y[:, -1]
             return
         while end - t > 1e-12:
-            options["first_step"] = end - t
             if not self.way:
                 self.way = self.decide(t, self.x, k)
+                if self.way:  # away from the event's own zero, from which the speed may come back within a step
+                    short = min(1e-4 * self.dt, end - t)
+                    run = solve_ivp(self.derivative, (t, t + short), self.x, args=(k, self.way), method="DOP853")
+                    t, self.x = t + short, run.y[:, -1]
+                    continue
+            options["first_step"] = end - t
             stop = lambda s, x, k, way: self.e @ x[self.N : 2 * self.N] * way  # noqa: E731
             slip = lambda s, x, k, way: self.level(0.0) - abs(self.rub(s, x, k, 0))  # noqa: E731
             event = stop if self.way else slip

@@ -8,10 +8,11 @@ case, so that nothing has to be smoothed and derivatives are those of the true m
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxsid.mechanics.effects.catalogue import Numbers, slips
+from jaxsid.mechanics.effects.catalogue import Numbers, rubbing, slips
 
 ROUNDS = 3  # of the magnitude at the mean speed, of one contact
 SWEEPS = 12  # over contacts that act on each other
@@ -42,24 +43,27 @@ def friction(
         free: speeds at the end if nothing rubbed.
         give: what a unit of each force takes off each speed, symmetric and positive where forces act.
     """
+    acting = _acting(kinds)
+    if not acting:
+        return Contact(jnp.zeros_like(before), sliding)
     start = jnp.where(sliding == 0, 0.0, before)
     most = slips(kinds, parameters, jnp.zeros_like(start))
     own = jnp.diag(give)
-    able = (own > 0) & (most > 0)
+    able = (own > 0) & rubbing(kinds)
     own = jnp.where(able, own, 1.0)
     off = give - jnp.diag(jnp.diag(give))
 
     def sweep(_: Array | int, found: tuple[Array, Array]) -> tuple[Array, Array]:
         force, after = found
         level = slips(kinds, parameters, 0.5 * (jnp.abs(start) + jnp.abs(after)))
-        for i in range(len(force)):
+        for i in acting:
             alone = free[i] - off[i] @ force
             new = _one(start[i], sliding[i], alone, own[i], level[i], most[i], able[i])
             force, after = force.at[i].set(new[0]), after.at[i].set(new[2])
         return force, after
 
     found = jnp.zeros_like(start), start
-    if len(start) == 1:  # unrolled: a loop within a loop costs more than what it does
+    if len(acting) == 1:  # unrolled: a loop within a loop costs more than what it does
         for i in range(ROUNDS):
             found = sweep(i, found)
     else:
@@ -73,31 +77,41 @@ def friction(
 def holding(
     kinds: Numbers,
     parameters: Float[Array, "slots most"],
+    resting: Bool[Array, " slots"],
     gain: Float[Array, " slots"],
     give: Float[Array, "slots slots"],
 ) -> Float[Array, " slots"]:
     """Forces of contacts at rest at an instant: what balances all others, up to the static level.
 
     Args:
-        kinds: numbers of the kinds; of one that does not hold, a number of none.
+        kinds: numbers of the kinds.
         parameters: in their order.
+        resting: which contacts are at rest; the others do not hold.
         gain: relative accelerations if nothing held.
         give: what a unit of each force takes off each acceleration.
     """
-    most = slips(kinds, parameters, jnp.zeros_like(gain))
+    acting, most = _acting(kinds), slips(kinds, parameters, jnp.zeros_like(gain))
     own = jnp.diag(give)
-    held = (own > 0) & (most > 0)
+    held = (own > 0) & rubbing(kinds) & resting
     own = jnp.where(held, own, 1.0)
     off = give - jnp.diag(jnp.diag(give))
 
-    def sweep(_: Array, force: Array) -> Array:
+    def sweep(_: Array | int, force: Array) -> Array:
         for i in range(len(force)):
             force = force.at[i].set(
                 jnp.clip((gain[i] - off[i] @ force) / own[i], -most[i], most[i]) * held[i]
             )
         return force
 
-    return lax.fori_loop(0, 1 if len(gain) == 1 else SWEEPS, sweep, jnp.zeros_like(gain))
+    if len(acting) < 2:
+        return sweep(0, jnp.zeros_like(gain))
+    return lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(gain))
+
+
+def _acting(kinds: Numbers) -> list[int]:
+    """Slots that may be dry friction, as far as is known while the program is traced."""
+    rubs = rubbing(kinds)
+    return [i for i in range(len(rubs)) if not isinstance(rubs, np.ndarray) or rubs[i]]
 
 
 def _one(

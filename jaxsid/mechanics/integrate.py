@@ -114,6 +114,7 @@ def integrate(
     dt: Array,
     state: Float[Array, " n"],
     substeps: int | Array,
+    first: int | Array = 0,
 ) -> Path:
     """Motion from a state at the first sample.
 
@@ -124,6 +125,7 @@ def integrate(
         dt: sampling interval, s.
         state: to begin with.
         substeps: steps for each sampling interval; a traced number costs reverse differentiation.
+        first: number of the first sample in the record.
     """
     h = dt / substeps
     step = _step(system, h)
@@ -160,7 +162,7 @@ def integrate(
         return (x1, after), (x, sliding, mean)
 
     arrival = jnp.broadcast_to(late.arrival, late.new.shape)
-    steps = late._replace(arrival=arrival), jnp.arange(len(late.new), dtype=state.dtype)
+    steps = late._replace(arrival=arrival), first + jnp.arange(len(late.new), dtype=state.dtype)
     begin = _sliding_at(speeds, state)
     _, (states, sliding, mean) = lax.scan(sample, (state, begin), steps)
     return Path(states, sliding, mean)
@@ -174,7 +176,12 @@ def _sliding_at(speeds: Array, state: Array) -> Array:
 
 
 def instant_forces(
-    system: Augmented, slots: Slots, path: Path, u: Float[Array, "samples inputs"], dt: Array
+    system: Augmented,
+    slots: Slots,
+    path: Path,
+    u: Float[Array, "samples inputs"],
+    dt: Array,
+    first: int | Array = 0,
 ) -> Float[Array, "samples ports"]:
     """Forces at the sampling instants, friction where it holds in balance with all others.
 
@@ -184,6 +191,7 @@ def instant_forces(
         path: from `integrate`.
         u: inputs at the sampling instants.
         dt: sampling interval, s.
+        first: number of the first sample in the record.
     """
     count = slots.count
     speeds = system.seen[count : 2 * count]
@@ -196,7 +204,6 @@ def instant_forces(
         rubs = sliding * slips(slots.kinds, slots.parameters, jnp.abs(speed))
         force = force.at[:count].add(rubs)
         gain = speeds @ (system.A @ x + system.B @ pushed + system.G @ force)
-        resting = jnp.where(sliding == 0, slots.kinds, -1)
-        return force.at[:count].add(holding(resting, slots.parameters, gain, give))
+        return force.at[:count].add(holding(slots.kinds, slots.parameters, sliding == 0, gain, give))
 
-    return jax.vmap(at)(path.states, path.sliding, u, jnp.arange(len(u), dtype=u.dtype))
+    return jax.vmap(at)(path.states, path.sliding, u, first + jnp.arange(len(u), dtype=u.dtype))

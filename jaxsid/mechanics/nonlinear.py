@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsid.mechanics.augmented import Augmented, augmented
+from jaxsid.mechanics.effects.catalogue import possible
 from jaxsid.mechanics.held_input import Late, late_input, line_over_step, value_at_sample
 from jaxsid.mechanics.integrate import Path, instant_forces, integrate, phi_columns
 from jaxsid.mechanics.slots import Slots
@@ -41,8 +42,7 @@ def respond(
     state: Float[Array, " n"],
     substeps: int | Array,
 ) -> Response:
-    """Readings of a model with effects. An input is limited first, then scaled, delayed, made to lag; an output made to
-    lag first, then delayed, scaled, shifted.
+    """Readings of a model with effects over a whole record.
 
     Args:
         linear: the model without effects.
@@ -54,14 +54,58 @@ def respond(
         substeps: steps for each sampling interval.
     """
     system = augmented(linear, slots)
+    return respond_to(system, slots, forced(system, slots, u, ramps, dt), dt, state, substeps)
+
+
+def forced(
+    system: Augmented,
+    slots: Slots,
+    u: Float[Array, "samples inputs"],
+    ramps: Bool[Array, " inputs"],
+    dt: Array,
+) -> Late:
+    """What acts on the bodies: the inputs, limited first, then scaled, then late. Their lag is part of the system.
+
+    Args:
+        system: from `augmented`.
+        slots: the effects.
+        u: inputs.
+        ramps: which are held to first order, the others to zero order.
+        dt: sampling interval, s.
+    """
     change = system.changed
     inverse = change.inverse_limit @ slots.inputs
     limit = jnp.where(inverse > 0, 1 / jnp.where(inverse > 0, inverse, 1.0), jnp.inf)
     pushed = jnp.clip(u, -limit, limit) * (1 + change.gain @ slots.inputs)
-    late = late_input(pushed, ramps, change.delay @ slots.inputs / dt)
-    path = integrate(system, slots, late, dt, state, substeps)
-    now = value_at_sample(late)
-    forces = instant_forces(system, slots, path, now, dt)
+    return late_input(pushed, ramps, change.delay @ slots.inputs / dt)
+
+
+def respond_to(
+    system: Augmented,
+    slots: Slots,
+    late: Late,
+    dt: Float[Array, ""],
+    state: Float[Array, " n"],
+    substeps: int | Array,
+    first: int | Array = 0,
+) -> Response:
+    """Readings of a model with effects. An output lags first, then it is delayed, scaled, shifted.
+
+    Args:
+        system: from `augmented`.
+        slots: the effects.
+        late: from `forced`, of a whole record or a part of it.
+        dt: sampling interval, s.
+        state: at the first sample, as in `Response`.
+        substeps: steps for each sampling interval.
+        first: number of the first sample in the record, for laws that depend on time.
+    """
+    change = system.changed
+    path = integrate(system, slots, late, dt, state, substeps, first)
+    forces = instant_forces(system, slots, path, value_at_sample(late), dt, first)
+    if not any(kind.where == "sensor" for kind in possible(slots.kinds)):
+        outputs = path.states @ system.C.T + value_at_sample(late) @ system.D.T + forces @ system.F.T
+        return Response(outputs, path.states, forces[:, : slots.count])
     delays = change.delay @ slots.sensors / dt
     read = jax.vmap(_delayed, (0, 0, 0, 0, None, None, None, None, None), 1)
     outputs = read(system.C, system.D, system.F, delays, system, path, forces, late, dt)

@@ -230,7 +230,7 @@ def simulate(
     require(initial in ("rest", "estimate"), f"initial '{initial}' is unknown; choose 'rest' or 'estimate'.")
     require(bool(model.sensors and model.inputs), f"{model.name}: simulation needs an input and a sensor.")
     record = _as_record(model, record, dt)
-    u, hold = _inputs(model, record)
+    u, hold = ordered_inputs(model, record)
     linear = physical_displacement_velocity(second_order(model))
     if model.effects:
         given = driven(model, u, hold, record.dt, number)
@@ -257,7 +257,7 @@ def _as_record(model: LumpedModel, record: Record | Mapping[str, ArrayLike], dt:
     return Record(u, jnp.zeros((len(u), 0)), dt, inputs=tuple(record), outputs=(), name=model.name)
 
 
-def _inputs(model: LumpedModel, record: Record) -> tuple[Array, tuple[str, ...]]:
+def ordered_inputs(model: LumpedModel, record: Record) -> tuple[Array, tuple[str, ...]]:
     order, hold = [], []
     for wanted in model.inputs:
         require(
@@ -292,15 +292,20 @@ def _said(motion: Motion, model: LumpedModel) -> Array:
 def _from_estimate(
     linear: ContinuousModel, model: LumpedModel, record: Record, u: Array, hold: tuple[str, ...]
 ) -> Array:
-    rows, measured = _measured(model, record)
+    rows, measured = measured_sensors(model, record)
     free = discretise(linear, record.dt)
     forced = simulate_linear(linear, u, record.dt, hold=hold)
     fit = _fit_state(free.A, linear.C[rows], record.y[:, measured] - forced[:, rows])
     return forced + simulate_linear(free, jnp.zeros_like(u), initial_state=fit.state)
 
 
-def _measured(model: LumpedModel, record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the model's sensors that the record has, and of their columns there."""
+def measured_sensors(model: LumpedModel, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the model's sensors that the record has, and of their columns there.
+
+    Args:
+        model: names the sensors.
+        record: has some of them.
+    """
     known = [
         (i, record.outputs.index(s.name)) for i, s in enumerate(model.sensors) if s.name in record.outputs
     ]
@@ -323,7 +328,7 @@ def _state_with_effects(
     substeps: int | None,
 ) -> Array:
     """The initial state that fits a record, from that of the linear part; the effects' own states with it."""
-    rows, measured = _measured(model, record)
+    rows, measured = measured_sensors(model, record)
     free = discretise(linear, record.dt)
     y = record.y[:, measured]
     start = _fit_state(

@@ -15,7 +15,7 @@ class Slots(eqx.Module):
     """Effects, each with its kind, parameters and place; all rows may be traced.
 
     Attributes:
-        kinds: (slots,) numbers in the catalogue.
+        kinds: (slots,) numbers in the catalogue; in numpy inside a program that is for these kinds only.
         parameters: (slots, most) in the order of the kind.
         joints: (slots, N) +1 and -1 at the second and first end, +1 at a body; zero for signals.
         pushes: (slots, N) where and how a positive force acts: -joints between two ends, +1 at a body.
@@ -23,7 +23,7 @@ class Slots(eqx.Module):
         inputs: (slots, inputs) 1 at the input.
     """
 
-    kinds: Int[Array, " slots"]
+    kinds: Int[Array, " slots"] | Int[np.ndarray, " slots"]
     parameters: Float[Array, "slots most"]
     joints: Float[Array, "slots N"]
     pushes: Float[Array, "slots N"]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.mechanics.lumped import GROUND, LumpedModel, Matrices, incidence, lumped_model
+from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, Matrices, incidence, lumped_model
 from jaxsid.physical.parameterization import BLIND, Matrix, Triple
 from jaxsid.records import as_array
 
@@ -17,10 +17,14 @@ ROUNDING = 1e-9  # sum of a row, next to its entries, that is none
 
 
 class Element(NamedTuple):
-    """One number of a lumped model, such as the "stiffness" of "gearbox"; for matrices, of "b1, b2" or "ground, b1"."""
+    """One number of a lumped model, such as the "stiffness" of "gearbox"; for matrices, of "b1, b2" or "ground, b1".
+
+    That of an effect is one such as the "force" of "coulomb_friction(ground, motor)", of this `kind`.
+    """
 
     element: str
     quantity: str
+    kind: str = ""
 
     @property
     def name(self) -> str:
@@ -102,7 +106,7 @@ class LinearMatrices(eqx.Module):
         )
 
 
-def element_matrices(model: LumpedModel) -> LinearMatrices:
+def element_matrices(model: LumpedModel, *, effects: bool = False) -> LinearMatrices:
     """The unknowns that a model has: masses, dampings, stiffnesses of its elements, in this order.
 
     A spring may damp, also where the model gives it none; a connection without stiffness stays so, since what no
@@ -111,6 +115,7 @@ def element_matrices(model: LumpedModel) -> LinearMatrices:
 
     Args:
         model: says which there are; its numbers give their sizes.
+        effects: whether the parameters of effects, as far as the model gives them, are unknowns too, after the others.
     """
     shapes, names, values = _entries(model) if model.matrices is not None else _elements(model)
     counts = np.cumsum([0, *(len(x) for x in shapes)])
@@ -118,7 +123,7 @@ def element_matrices(model: LumpedModel) -> LinearMatrices:
         np.pad(x, ((counts[i], counts[3] - counts[i + 1]), (0, 0), (0, 0))) for i, x in enumerate(shapes)
     ]
     whole = np.concatenate([x.reshape(counts[3], -1) for x in directions], axis=1)
-    return LinearMatrices(
+    linear = LinearMatrices(
         (directions[0], directions[1], directions[2]),
         inverse=np.linalg.pinv(whole.T),
         base=np.zeros(counts[3]),
@@ -127,6 +132,61 @@ def element_matrices(model: LumpedModel) -> LinearMatrices:
         nominal=np.concatenate(values),
         listed=tuple(Element(e, q) for q, elements in zip(QUANTITIES, names, strict=True) for e in elements),
     )
+    return _with_effects(linear, model) if effects and model.effects else linear
+
+
+def _with_effects(linear: LinearMatrices, model: LumpedModel) -> LinearMatrices:
+    """Unknowns of which M, D, K do not depend, after the others."""
+    values = np.concatenate(
+        [np.ravel(np.asarray(e.parameters[k])) for e in model.effects for k in e.parameters]
+    )
+    more = len(values)
+    directions = [np.pad(x, ((0, more), (0, 0), (0, 0))) for x in linear.directions]
+    return LinearMatrices(
+        (directions[0], directions[1], directions[2]),
+        inverse=np.pad(linear.inverse, ((0, more), (0, 0))),
+        base=np.pad(linear.base, (0, more)),
+        mix=np.pad(linear.mix, ((0, more), (0, more)))
+        + np.diag(np.pad(np.ones(more), (len(linear.listed), 0))),
+        scale=np.concatenate([linear.scale, np.where(values == 0, 1.0, np.abs(values))]),
+        nominal=np.concatenate([linear.nominal, values]),
+        listed=linear.listed + effect_numbers(model),
+    )
+
+
+def effect_numbers(model: LumpedModel) -> tuple[Element, ...]:
+    """The parameters of a model's effects that it gives, in order; those with one a record as "phase[0]", ...
+
+    Args:
+        model: with effects.
+    """
+    labels = [_label(effect) for effect in model.effects]
+    found = []
+    for number, (effect, label) in enumerate(zip(model.effects, labels, strict=True)):
+        before = labels[:number].count(label)
+        unique = label if before == 0 else f"{label} #{before + 1}"
+        for name, value in effect.parameters.items():
+            of = [name] if np.ndim(value) == 0 else [f"{name}[{i}]" for i in range(len(value))]
+            found += [Element(unique, x, effect.kind) for x in of]
+    return tuple(found)
+
+
+def _label(effect: Effect) -> str:
+    ((_, place),) = effect.place
+    return f"{effect.kind}({place if isinstance(place, str) else ', '.join(place)})"
+
+
+def _effects_with(model: LumpedModel, values: Float[Array, " p"]) -> list[Effect]:
+    """Effects with other parameters, in the order of `effect_numbers`."""
+    found, at = [], 0
+    for effect in model.effects:
+        parameters = {}
+        for name, old in effect.parameters.items():
+            size = np.size(np.asarray(old))
+            parameters[name] = values[at : at + size].reshape(np.shape(old))
+            at += size
+        found.append(Effect(effect.kind, effect.place, parameters))
+    return found
 
 
 def unit_diagonal(information: Float[np.ndarray, "p p"]) -> tuple[np.ndarray, np.ndarray]:
@@ -236,18 +296,21 @@ def _sizes(values: np.ndarray) -> np.ndarray:
 
 
 def with_values(model: LumpedModel, values: Float[Array, " p"]) -> LumpedModel:
-    """The model with other values of its `element_matrices`, in their order; effects are left out.
+    """The model with other values of its `element_matrices`, in their order.
 
     Args:
         model: whose unknowns they are.
-        values: of all of them, SI units.
+        values: of all of them, SI units; without those of effects, effects are left out.
     """
+    linear = len(element_matrices(model).listed)
     places = {
         "inputs": model.inputs,
         "sensors": model.sensors,
         "tolerance": model.tolerance,
         "name": model.name,
+        "effects": _effects_with(model, values[linear:]) if len(values) > linear else (),
     }
+    values = values[:linear]
     if model.matrices is not None:
         directions = element_matrices(model).directions
         found = (jnp.einsum("p,pij->ij", values, jnp.asarray(x)) for x in directions)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsid.compilation import compiled
 from jaxsid.least_squares import levenberg_marquardt, sums_of
 from jaxsid.physical.elements import LinearMatrices
+from jaxsid.physical.motion import MotionTerm
 from jaxsid.physical.parameterization import Parameterization
 from jaxsid.physical.restrictions import Prior, Restricted
 from jaxsid.physical.terms import Term
@@ -25,6 +26,7 @@ SEARCHES = 80  # of the bounded quasi-Newton method, which only finds out which 
 GAIN = 1e-8  # part of the sum of squares that a last step may still bring
 ROUNDS = 8  # of changing which bounds hold
 NEAR = 1e-7  # of an unknown's scale: closer to a bound it lies on it
+Data = Term | MotionTerm
 Solver = optimistix.AbstractLeastSquaresSolver
 
 
@@ -58,10 +60,17 @@ class _Sums(NamedTuple):
     gradient: Array
 
 
-def _sums(terms: tuple[Term, ...], parameterization: Parameterization, theta: Array) -> _Sums:
-    matrices = parameterization.matrices(theta)
-    M, D, K = (jnp.moveaxis(x, -1, 0) for x in jax.jacfwd(parameterization.matrices)(theta))
-    parts = [sums_of(*term.evaluate(matrices, (M, D, K))) for term in terms]
+def _sums(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> _Sums:
+    parts = []
+    if any(isinstance(term, Term) for term in terms):
+        matrices = parameterization.matrices(theta)
+        M, D, K = (jnp.moveaxis(x, -1, 0) for x in jax.jacfwd(parameterization.matrices)(theta))
+        parts += [sums_of(*term.evaluate(matrices, (M, D, K))) for term in terms if isinstance(term, Term)]
+    for term in terms:
+        if isinstance(term, MotionTerm):
+            assert isinstance(parameterization, LinearMatrices)
+            r, j = term.projected(parameterization, theta)
+            parts.append(sums_of(r.ravel(), j.reshape(-1, len(theta))))
     cost, product, gradient = (jnp.stack(x).sum(axis=0) for x in zip(*parts, strict=True))
     return _Sums(2 * cost, product, gradient)
 
@@ -73,7 +82,7 @@ def _with_prior(sums: _Sums, prior: Prior, theta: Array) -> tuple[Array, Array, 
 
 @compiled
 def most_probable(
-    terms: tuple[Term, ...],
+    terms: tuple[Data, ...],
     parameterization: Parameterization,
     prior: Prior,
     start: Float[Array, " p"],
@@ -108,12 +117,12 @@ def most_probable(
     )
 
 
-def _count(terms: tuple[Term, ...]) -> Array:
+def _count(terms: tuple[Data, ...]) -> Array:
     return jnp.asarray(sum(term.equations for term in terms))
 
 
 def _by_optimistix(
-    terms: tuple[Term, ...], parameterization: Parameterization, prior: Prior, start: Array, solver: Solver
+    terms: tuple[Data, ...], parameterization: Parameterization, prior: Prior, start: Array, solver: Solver
 ) -> Posterior:
     """The same by a solver of optimistix, to which all equations are p + 1 with the same squares and slopes."""
 
@@ -156,7 +165,7 @@ def _factored(squares: Array, product: Array, gradient: Array) -> tuple[Array, A
 
 
 @compiled
-def squares_at(terms: tuple[Term, ...], parameterization: Parameterization, theta: Array) -> Array:
+def squares_at(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> Array:
     """Sum of the squares of the data's weighted residual.
 
     Args:
@@ -169,7 +178,7 @@ def squares_at(terms: tuple[Term, ...], parameterization: Parameterization, thet
 
 @compiled
 def _bounded(
-    terms: tuple[Term, ...],
+    terms: tuple[Data, ...],
     parameterization: Parameterization,
     prior: Prior,
     start: Array,
@@ -203,7 +212,7 @@ class BoundedFit(NamedTuple):
     at_bound: Bool[np.ndarray, " p"]
 
 
-def within_bounds(terms: tuple[Term, ...], known: Restricted, start: Array) -> BoundedFit:
+def within_bounds(terms: tuple[Data, ...], known: Restricted, start: Array) -> BoundedFit:
     """The mode of the posterior within the bounds, exact for those that hold: an active-set method.
 
     Where the free mode lies outside, what it exceeds is held at the bounds and the rest fitted anew; bounds that are
@@ -232,7 +241,7 @@ def within_bounds(terms: tuple[Term, ...], known: Restricted, start: Array) -> B
 
 
 def _with_active_bounds(
-    terms: tuple[Term, ...], known: Restricted, start: np.ndarray, held: np.ndarray
+    terms: tuple[Data, ...], known: Restricted, start: np.ndarray, held: np.ndarray
 ) -> tuple[BoundedFit, bool]:
     """The mode with some unknowns at their bounds, these changed until all pull outwards; whether they were."""
     free, scale = known.unknowns, np.asarray(known.unknowns.scale)
@@ -259,7 +268,7 @@ def _with_active_bounds(
 
 @compiled
 def gradient_at(
-    terms: tuple[Term, ...], parameterization: Parameterization, prior: Prior, theta: Array
+    terms: tuple[Data, ...], parameterization: Parameterization, prior: Prior, theta: Array
 ) -> Array:
     """Slope of half the sum of squares of data and prior.
 

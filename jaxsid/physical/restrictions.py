@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import bad_input, require
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import Element, LinearMatrices, element_matrices
 from jaxsid.physical.parameterization import Matrix
@@ -75,7 +76,7 @@ def restricted(
     Raises:
         InputError: unknown names, contradictions, nothing left to refine.
     """
-    every = element_matrices(model)
+    every = element_matrices(model, effects=True)
     names = [x.name for x in every.listed]
     still = np.zeros(len(names), bool)
     for text in fixed:
@@ -177,13 +178,19 @@ def _known(
 
 
 def _natural_bounds(model: LumpedModel, every: LinearMatrices) -> tuple[np.ndarray, np.ndarray]:
-    """Masses are positive, springs and dampers of elements not negative."""
-    lowest = {"mass": SMALLEST, "damping": 0.0, "stiffness": 0.0}
+    """Masses are positive, springs and dampers of elements not negative, effects' parameters as their kinds say."""
     low = np.array([
-        -np.inf if model.matrices is not None and not _diagonal(x) else lowest[x.quantity] * abs(size)
-        for x, size in zip(every.listed, every.nominal, strict=True)
+        _lowest(model, x, float(size)) for x, size in zip(every.listed, every.nominal, strict=True)
     ])  # fmt: skip
     return low, np.full(len(low), np.inf)
+
+
+def _lowest(model: LumpedModel, x: Element, size: float) -> float:
+    if x.kind:
+        return next(p.lowest for p in CATALOGUE[x.kind].parameters if p.name == x.quantity.partition("[")[0])
+    if model.matrices is not None and not _diagonal(x):
+        return -np.inf
+    return SMALLEST * abs(size) if x.quantity == "mass" else 0.0
 
 
 def _diagonal(x: Element) -> bool:

@@ -9,6 +9,7 @@ from jaxsid.impulse.spectra import FrequencyResponse
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.measured import check_response
 from jaxsid.physical.restrictions import restricted
+from jaxsid.pipeline.refine_motion import refine_motion
 from jaxsid.pipeline.refine_records import refine_records
 from jaxsid.pipeline.refine_responses import refine_frequencies, refine_response, refine_traced
 from jaxsid.records import ImpulseResponse, Record
@@ -30,6 +31,8 @@ def refine(
     noise: ResponseNoise | None = None,
     dt: ArrayLike | None = None,
     band: Pair | None = None,
+    window: float | None = None,
+    initial: str = "estimate",
     validate: bool = True,
     progress: Progress | None = None,
 ) -> Refinement:
@@ -51,7 +54,11 @@ def refine(
         noise: of an impulse response; estimated where None. That of records always is, with its colour.
         dt: sampling interval (s) of the records that a frequency response came from; None if it is one in continuous
             time.
-        band: frequencies (Hz) of records to use; None finds what the inputs excite.
+        band: frequencies (Hz) of records to use; None finds what the inputs excite. Not for fits by simulation.
+        window: of records, fit by simulation in windows of this length (s), each from its own initial state; 0: whole
+            records. None: lines of the spectrum for models without effects, else whole records, or, on a free axis, a
+            tenth of its time constant. In windows, deviations are those of groups of windows, whatever their errors.
+        initial: of records, "estimate" fits each initial state, "rest" takes it for zero, which asks for simulation.
         validate: fit first to a part of the data and predict the rest: the first three quarters of every record, three
             of four samples of a response.
         progress: called with a line of text as each stage begins.
@@ -67,7 +74,13 @@ def refine(
     Element Model Updating in Structural Dynamics, 1995.
     """
     say = progress or (lambda text: None)
-    require(not model.effects, f"{model.name}: models with effects cannot be refined by this version.")
+    of_records = isinstance(data, (Record, Sequence))
+    require(
+        of_records or not model.effects,
+        f"{model.name}: it has effects, of which an impulse or frequency response cannot tell. Give records.",
+    )
+    require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
+    require(window is None or window >= 0, f"window must not be negative, it is {window} s.")
     known = restricted(model, fixed=fixed, tied=tied, bounds=bounds, priors=priors)
     if isinstance(data, ImpulseResponse):
         check_response(data, len(model.sensors), len(model.inputs))
@@ -78,4 +91,7 @@ def refine(
     if isinstance(data, FrequencyResponse):
         return refine_frequencies(model, known, data, dt, validate, say)
     records = (data,) if isinstance(data, Record) else tuple(data)
+    if model.effects or window is not None or initial == "rest":
+        require(band is None, "band is for fits to lines of the spectrum; this one is in time.")
+        return refine_motion(model, known, records, window, initial, validate, say)
     return refine_records(model, known, records, band, validate, say)

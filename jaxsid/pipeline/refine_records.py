@@ -13,6 +13,7 @@ from jaxsid.physical.inband_fit import Target, fit_target
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.physical.terms import LineTerm
 from jaxsid.physical.widened import widened_start
+from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.matrices import sensed_rows
 from jaxsid.pipeline.refining import Problem, concluded, fitted_model, nominal_unknowns, solved
 from jaxsid.pipeline.setting import setting
@@ -21,8 +22,6 @@ from jaxsid.records import Record, as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
-LAGS = 200  # of the correlations of what is left, at most
-ONE_PERCENT = 2.576  # standard deviations that chance exceeds once in a hundred times, either side
 Say = Callable[[str], None]
 Pair = tuple[float, float]
 
@@ -144,31 +143,6 @@ def _left(model: LumpedModel, record: Record) -> np.ndarray:
 def _residuals(model: LumpedModel, records: Sequence[Record], outputs: Sequence[str]) -> Residuals:
     """Correlations of what the model leaves of the longest record that has all outputs, else of the longest."""
     record = max(records, key=lambda r: (len(r.outputs), len(r.y)))
-    error = _left(model, record)
-    samples, lags = len(error), min(LAGS, len(error) // 4)
-    error = error - error.mean(axis=0)
-    u = np.asarray(record.u) - np.asarray(record.u).mean(axis=0)
-    size = 2 * samples
-    error = error / np.maximum(error.std(axis=0), np.finfo(float).tiny)
-    u = u / np.maximum(u.std(axis=0), np.finfo(float).tiny)
-    E, U = np.fft.rfft(error, size, axis=0), np.fft.rfft(u, size, axis=0)
-    own, driving = (np.fft.irfft(np.abs(x) ** 2, size, axis=0) / samples for x in (E, U))
-    both = np.fft.irfft(E[:, :, None] * U.conj()[:, None, :], size, axis=0) / samples
-    # the variance of a cross-correlation of independent signals: the sum of the products of their autocorrelations
-    spread = np.sqrt(np.maximum((own[:, :, None] * driving[:, None, :]).sum(axis=0), 0.0) / samples)
-    rows = [outputs.index(n) for n in record.outputs]
-    autocorrelation = np.full((lags + 1, len(outputs)), np.nan)
-    cross = np.full((2 * lags + 1, len(outputs), u.shape[1]), np.nan)
-    limit = np.full((len(outputs), u.shape[1]), np.nan)
-    autocorrelation[:, rows] = own[: lags + 1]
-    cross[:, rows] = np.concatenate([both[-lags:], both[: lags + 1]])
-    limit[rows] = ONE_PERCENT * spread
-    dt = float(record.dt)
-    return Residuals(
-        lags=as_array(dt * np.arange(lags + 1)),
-        autocorrelation=as_array(autocorrelation),
-        white_limit=float(ONE_PERCENT / np.sqrt(samples)),
-        cross_lags=as_array(dt * np.arange(-lags, lags + 1)),
-        cross_correlation=as_array(cross),
-        cross_limit=as_array(limit),
-    )
+    error = np.full((len(record.y), len(outputs)), np.nan)
+    error[:, [outputs.index(n) for n in record.outputs]] = _left(model, record)
+    return correlations(error, np.asarray(record.u), float(record.dt))

@@ -15,8 +15,9 @@ from jaxsid.mechanics.simulate import markov_parameters
 from jaxsid.physical.cbsi import visible_states
 from jaxsid.physical.elements import ElementValues, with_values
 from jaxsid.physical.measured import every_other, frequency_term, response_term, response_weights
-from jaxsid.physical.posterior import most_probable
+from jaxsid.physical.posterior import BoundedFit, most_probable
 from jaxsid.physical.restrictions import Restricted
+from jaxsid.physical.terms import ResponseTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.refining import (
     Problem,
@@ -29,7 +30,7 @@ from jaxsid.pipeline.refining import (
 from jaxsid.realization.era import era
 from jaxsid.records import ImpulseResponse, SecondOrderModel, as_array
 from jaxsid.refinement import Refinement, Validation
-from jaxsid.uncertainty.noise import ResponseNoise
+from jaxsid.uncertainty.noise import CorrelatedNoise, ResponseNoise
 
 Say = Callable[[str], None]
 
@@ -109,7 +110,17 @@ def refine_response(
         validation = Validation(
             as_array(errors(model, ~used)), as_array(errors(trained, ~used)), "every fourth sample"
         )
-    return concluded(problem, model, fit, noise, outputs, errors, validation)
+    spread = (lambda found: _spread(every[0], found, noise)) if isinstance(noise, CorrelatedNoise) else None
+    return concluded(problem, model, fit, spread, outputs, errors, validation)
+
+
+def _spread(term: ResponseTerm, fit: BoundedFit, noise: CorrelatedNoise) -> np.ndarray:
+    """Covariance of J'r of a fit whose weights are not those of its noise."""
+    unknowns = fit.unknowns
+    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
+    mass, damping, stiffness = (jnp.asarray(np.einsum("ep,eij->pij", mix, x)) for x in unknowns.directions)
+    left = term.left(unknowns.matrices(fit.posterior.theta), (mass, damping, stiffness))
+    return np.asarray(noise.covariance(left[1:] * term.weight))
 
 
 def _response_of(model: LumpedModel, ir: ImpulseResponse) -> Array:

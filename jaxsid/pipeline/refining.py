@@ -18,16 +18,15 @@ from jaxsid.physical.elements import (
     with_values,
 )
 from jaxsid.physical.parameterization import BLIND
-from jaxsid.physical.posterior import BoundedFit, squares_at, within_bounds
+from jaxsid.physical.posterior import BoundedFit, Data, squares_at, within_bounds
 from jaxsid.physical.restrictions import Restricted
-from jaxsid.physical.terms import ResponseTerm, Term
 from jaxsid.pipeline.matrices import GOOD, POOR
 from jaxsid.records import as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
-from jaxsid.uncertainty.noise import CorrelatedNoise, ResponseNoise
 
 FAINT = 0.01  # part of a combination, next to its largest, that is not named
 Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
+Spread = Callable[[BoundedFit], np.ndarray]  # covariance of J'r, where it is not J'J
 
 
 class Problem(NamedTuple):
@@ -43,8 +42,8 @@ class Problem(NamedTuple):
     """
 
     known: Restricted
-    every: tuple[Term, ...]
-    train: tuple[Term, ...] | None
+    every: tuple[Data, ...]
+    train: tuple[Data, ...] | None
     starts: tuple[Array, ...]
     nuisances: int = 0
     weighed: bool = True
@@ -55,10 +54,12 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     known, first = problem.known, problem.train or problem.every
     best, least = None, np.inf
     for start in problem.starts:
-        if not np.isfinite(float(squares_at(first, known.unknowns, start))):
+        if len(problem.starts) > 1 and not np.isfinite(float(squares_at(first, known.unknowns, start))):
             continue
         fit = within_bounds(first, known, start)
         squares = float(fit.posterior.squares)
+        if not np.isfinite(squares):
+            continue
         if squares < least:
             best, least = fit, squares
         if problem.weighed and squares < GOOD * float(fit.posterior.equations):
@@ -92,7 +93,7 @@ class _Uncertain(NamedTuple):
     information: np.ndarray
 
 
-def _uncertainty(problem: Problem, fit: BoundedFit, noise: ResponseNoise | None) -> _Uncertain:
+def _uncertainty(problem: Problem, fit: BoundedFit, spread: Spread | None) -> _Uncertain:
     """The posterior's covariance near its mode; noise beyond what was assumed widens it."""
     p = fit.posterior
     free = problem.nuisances + int((np.diag(np.asarray(p.information)) > 0).sum())
@@ -101,8 +102,8 @@ def _uncertainty(problem: Problem, fit: BoundedFit, noise: ResponseNoise | None)
     precision = np.diag(np.where(fit.at_bound, 0.0, np.asarray(problem.known.prior.weight)) ** 2)
     both = told + precision
     inverse = _inverse(both)
-    if isinstance(noise, CorrelatedNoise):
-        inverse = _sandwich(problem, fit, noise, inverse) + inverse @ precision @ inverse
+    if spread is not None:
+        inverse = inverse @ (spread(fit) + precision) @ inverse
     prior = np.diag(precision)
     share = np.where(prior > 0, 1 - np.diag(inverse) * prior, 1.0)
     return _Uncertain(inverse, np.where(fit.at_bound, np.nan, share), misfit, both)
@@ -114,21 +115,6 @@ def _inverse(information: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(scaled)
     seen = values > 1e-14 * values[-1]
     return (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / safe / safe[:, None]
-
-
-def _sandwich(problem: Problem, fit: BoundedFit, noise: CorrelatedNoise, inverse: np.ndarray) -> np.ndarray:
-    """Covariance of a fit whose weights are not those of its noise."""
-    (term,) = problem.every
-    assert isinstance(term, ResponseTerm)
-    rows = _weighted_rows(term, fit.unknowns, fit.posterior.theta)
-    return inverse @ np.asarray(noise.covariance(rows)) @ inverse
-
-
-def _weighted_rows(term: ResponseTerm, unknowns: LinearMatrices, theta: Array) -> Array:
-    """J' w of an impulse response, (p, samples, outputs, inputs)."""
-    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
-    mass, damping, stiffness = (jnp.asarray(np.einsum("ep,eij->pij", mix, x)) for x in unknowns.directions)
-    return term.left(unknowns.matrices(theta), (mass, damping, stiffness))[1:] * term.weight
 
 
 def _open(unknowns: LinearMatrices, information: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -152,14 +138,14 @@ def concluded(
     problem: Problem,
     model: LumpedModel,
     fit: BoundedFit,
-    noise: ResponseNoise | None,
+    spread: Spread | None,
     outputs: tuple[str, ...],
     errors: Errors,
     validation: Validation | None,
     residuals: Callable[[LumpedModel], Residuals] | None = None,
 ) -> Refinement:
     """Everything that is reported of a fit."""
-    certain = _uncertainty(problem, fit, noise)
+    certain = _uncertainty(problem, fit, spread)
     unknowns, theta = fit.unknowns, fit.posterior.theta
     blind = blind_elements(unknowns, certain.information)
     values = element_values(unknowns, theta, certain.covariance, blind)

@@ -17,4 +17,5 @@ EFFECT = Kind(
     about="The current loop of a motor, a valve, a shaker's coil.",
     source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",
     changes=_changes,
+    states=1,
 )

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxsid.checks import bad_input, is_concrete, require
 from jaxsid.mechanics import effects
@@ -84,9 +84,20 @@ def _chosen(kind: Kind, kinds: Numbers, parameters: Array) -> tuple[Array, list[
     return here, [jnp.where(here, parameters[:, i], p.typical) for i, p in enumerate(kind.parameters)]
 
 
+def possible(kinds: Numbers) -> list[Kind]:
+    """All kinds; where the slots' kinds are known while the program is traced, those alone.
+
+    Args:
+        kinds: numbers of the kinds.
+    """
+    if isinstance(kinds, np.ndarray):
+        return [kind for number, kind in enumerate(CATALOGUE.values()) if number in kinds]
+    return list(CATALOGUE.values())
+
+
 def _total(hook: str, kinds: Numbers, parameters: Array, seen: Any) -> Array:
     total = jnp.zeros(len(parameters), parameters.dtype)
-    for kind in CATALOGUE.values():
+    for kind in possible(kinds):
         law = getattr(kind, hook)
         if law is not None:
             here, values = _chosen(kind, kinds, parameters)
@@ -115,6 +126,12 @@ def slips(kinds: Numbers, parameters: Float[Array, "slots most"], speed: Array) 
     return _total("slip", kinds, parameters, speed)
 
 
+def rubbing(kinds: Numbers) -> Bool[Array, " slots"] | Bool[np.ndarray, " slots"]:
+    """Which slots are dry friction, whatever its magnitude."""
+    numbers = [kind_number(kind.name) for kind in CATALOGUE.values() if kind.slip is not None]
+    return (np if isinstance(kinds, np.ndarray) else jnp).isin(kinds, np.array(numbers))
+
+
 def changes(kinds: Numbers, parameters: Float[Array, "slots most"], nominal: Nominal) -> Changes:
     """What every slot changes in the linear model and in signals, each (slots,).
 
@@ -124,7 +141,7 @@ def changes(kinds: Numbers, parameters: Float[Array, "slots most"], nominal: Nom
         nominal: what the model has at the place of each slot.
     """
     total = [jnp.zeros(len(parameters), parameters.dtype)] * len(Changes._fields)
-    for kind in CATALOGUE.values():
+    for kind in possible(kinds):
         if kind.changes is not None:
             here, values = _chosen(kind, kinds, parameters)
             found = kind.changes(nominal, *values)

@@ -29,4 +29,5 @@ EFFECT = Kind(
     source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976).",
     force=_force,
     rate=_rate,
+    states=1,
 )

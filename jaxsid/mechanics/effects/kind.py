@@ -107,6 +107,7 @@ class Kind(NamedTuple):
         force: F, from a `Motion`; smooth, or with kinks, but without jumps.
         rate: derivative of the memory in time, from a `Motion`.
         slip: magnitude of dry friction, F = slip sign(v), from the speed; at rest it balances up to slip(0).
+        states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Kind(NamedTuple):
     force: Callable[..., Any] | None = None
     rate: Callable[..., Any] | None = None
     slip: Callable[..., Any] | None = None
+    states: int = 0
 
 
 def power(x: Array, exponent: Array) -> Array:

@@ -21,4 +21,5 @@ EFFECT = Kind(
     about="A flexible part that was taken for rigid: it adds a resonance and splits those near it.",
     source="J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, ch. 3.",
     changes=_changes,
+    states=2,
 )

@@ -17,4 +17,5 @@ EFFECT = Kind(
     about="A low-pass filter in the transducer or its amplifier.",
     source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",
     changes=_changes,
+    states=1,
 )

@@ -1,0 +1,196 @@
+"""Refinement of a model with effects against raw records, by simulation in time."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.compilation import compiled
+from jaxsid.impulse.whitening import whitening_filter
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.elements import LinearMatrices, element_matrices, with_values
+from jaxsid.physical.motion import Left, MotionTerm
+from jaxsid.physical.posterior import BoundedFit
+from jaxsid.physical.restrictions import Restricted
+from jaxsid.pipeline.correlations import correlations
+from jaxsid.pipeline.motion_terms import Windows, lowest_frequency, motion_term, window_length
+from jaxsid.pipeline.refining import Problem, concluded, nominal_unknowns, solved
+from jaxsid.records import Record, as_array
+from jaxsid.refinement import Refinement, Residuals, Validation
+
+HELD_OUT = 0.25  # part of the end of every record that is kept for validation
+ROUNDS = 2  # fits after which level and colour of the noise, and then the windows, are found anew
+SAME = 0.1  # relative change of a window that is none
+PERIODS = 2  # of the slowest vibration, in a window to start with
+CLUSTERS = 30  # groups of windows whose errors are taken for independent
+Say = Callable[[str], None]
+Terms = tuple[MotionTerm, ...]
+
+
+def refine_motion(
+    model: LumpedModel,
+    known: Restricted,
+    records: tuple[Record, ...],
+    window: float | None,
+    initial: str,
+    validate: bool,
+    say: Say,
+) -> Refinement:
+    terms, cuts, theta = _settled(model, known, records, window, initial == "rest", say)
+    say("values of the model and its effects")
+    early = tuple(_held_out(term, late=False) for term in terms) if validate else None
+    nuisances = sum(len(term.free) * len(term.state) for term in terms)
+    problem = Problem(known, terms, early, (theta,), nuisances)
+    fit, before = solved(problem)
+    say("validation")
+
+    def errors(m: LumpedModel, of: Terms = terms, seen: Terms = terms) -> np.ndarray:
+        values = jnp.asarray(element_matrices(m, effects=True).nominal)
+        return _errors(of, seen, known.unknowns, known.unknowns.of_values(values))
+
+    validation = None
+    if before is not None and early is not None:
+        late = tuple(_held_out(term, late=True) for term in terms)
+        # a whole record goes on from its first part; windows of the last part begin anew
+        begun = tuple(e if cut.whole else x for e, x, cut in zip(early, terms, cuts, strict=True))
+        validation = Validation(
+            as_array(errors(model, late, begun)),
+            as_array(_errors(late, begun, before.unknowns, before.posterior.theta)),
+            "the last quarter of every record",
+        )
+    windowed = not all(cut.whole for cut in cuts)
+    spread = (lambda found: _spread(terms, found)) if windowed else None
+    outputs = tuple(s.name for s in model.sensors)
+
+    def residuals(_: LumpedModel) -> Residuals:
+        return _residuals(terms, cuts, fit)
+
+    return concluded(problem, model, fit, spread, outputs, errors, validation, residuals)
+
+
+def _settled(
+    model: LumpedModel,
+    known: Restricted,
+    records: tuple[Record, ...],
+    window: float | None,
+    rest: bool,
+    say: Say,
+) -> tuple[Terms, list[Windows], Array]:
+    """The records with windows and noise that agree with the model fitted to them, and its unknowns."""
+    cuts, theta = window_length(model, records, window), nominal_unknowns(known)
+    short = window_length(model, records, PERIODS / lowest_frequency(model))
+    if np.isfinite(lowest_frequency(model)) and any(
+        cut.length > 2 * x.length for cut, x in zip(cuts, short, strict=True)
+    ):
+        # a long simulation by wrong values has many misleading minima, a short one none
+        say("a start from short windows")
+        parts = tuple(motion_term(model, records, cut, rest=False) for cut in short)
+        theta = _fitted(known, parts, theta)
+    for remaining in reversed(range(ROUNDS)):
+        say("windows and initial states")
+        terms = tuple(motion_term(model, records, cut, rest=rest) for cut in cuts)
+        for _ in range(ROUNDS):
+            say("level and colour of the noise")
+            theta = _fitted(known, terms, theta)
+            terms = _weighed(terms, cuts, known.unknowns, theta)
+        # where the windows follow from the model, those of the fitted one count
+        better = window_length(with_values(model, known.unknowns.values(theta)), records, window)
+        if not remaining or all(
+            abs(x.length - y.length) < SAME * y.length for x, y in zip(better, cuts, strict=True)
+        ):
+            break
+        cuts = better
+    return terms, cuts, theta
+
+
+def _fitted(known: Restricted, terms: Terms, start: Array) -> Array:
+    fit, _ = solved(Problem(known, terms, None, (start,), weighed=False))
+    return fit.posterior.theta
+
+
+@compiled
+def _left(term: MotionTerm, unknowns: LinearMatrices, theta: Array) -> Left:
+    return term.left(unknowns, theta)
+
+
+@compiled
+def _scores(term: MotionTerm, unknowns: LinearMatrices, theta: Array) -> Float[Array, "windows p"]:
+    """Slope of half the sum of squares of every window."""
+    r, j = term.projected(unknowns, theta)
+    return jnp.einsum("wk,wkp->wp", r, j)
+
+
+def _weighed(terms: Terms, cuts: Sequence[Windows], unknowns: LinearMatrices, theta: Array) -> Terms:
+    """Level and colour of the noise of every sensor from what a fit left; the colour of whole records only."""
+    found = []
+    for term, cut in zip(terms, cuts, strict=True):
+        left, seen = np.asarray(_left(term, unknowns, theta).difference), np.asarray(term.weight) > 0
+        weight, color = np.zeros(seen.shape), np.array(term.color)
+        for output in range(left.shape[2]):
+            here = seen[:, :, output]
+            if not here.any():
+                continue
+            error = np.where(here, left[:, :, output], 0.0)
+            size = np.abs(np.asarray(term.y)[:, :, output]).max()
+            if cut.whole:
+                color[output] = whitening_filter(error[here.all(axis=1)] if here.all(axis=1).any() else error)
+                error = sum(c * np.roll(error, k, axis=1) for k, c in enumerate(color[output]))
+            level = np.sqrt((np.asarray(error)[here] ** 2).mean())
+            weight[:, :, output] = here / max(level, 1e-12 * size, np.finfo(float).tiny)
+        found.append(eqx.tree_at(lambda t: (t.weight, t.color), term, (as_array(weight), as_array(color))))
+    return tuple(found)
+
+
+def _held_out(term: MotionTerm, *, late: bool) -> MotionTerm:
+    """The term with the last quarter of every record alone, or without it."""
+    weight, first, record = (np.asarray(x) for x in (term.weight, term.first, term.record))
+    number = first[:, None] + np.arange(weight.shape[1])
+    measured = (weight > 0).any(axis=2)
+    ends = np.array([(number * measured)[record == r].max() + 1 for r in range(record.max() + 1)])
+    of_end = number >= (1 - HELD_OUT) * ends[record][:, None]
+    return eqx.tree_at(lambda t: t.weight, term, as_array(weight * (of_end == late)[:, :, None]))
+
+
+def _errors(of: Terms, seen: Terms, unknowns: LinearMatrices, theta: Array) -> np.ndarray:
+    """rms(y - yhat) / rms(y) of every output, where the first terms count, begun as the second ones tell."""
+    left = size = 0.0
+    for counted, given in zip(of, seen, strict=True):
+        weight = np.asarray(counted.weight) > 0
+        difference = np.asarray(_left(given, unknowns, theta).difference)
+        left = left + np.where(weight, difference**2, 0.0).sum(axis=(0, 1))
+        size = size + np.where(weight, np.asarray(counted.y) ** 2, 0.0).sum(axis=(0, 1))
+    return np.sqrt(left / np.where(np.asarray(size) > 0, size, 1.0))
+
+
+def _spread(terms: Terms, fit: BoundedFit) -> np.ndarray:
+    """Covariance of J'r from how it differs between groups of windows, whatever correlates the errors within one.
+
+    Source: K.-Y. Liang and S. Zeger, Biometrika 73 (1986).
+    """
+    total = np.zeros((len(fit.posterior.theta),) * 2)
+    for term in terms:
+        scores = np.asarray(_scores(term, fit.unknowns, fit.posterior.theta))
+        size = max(len(scores) // CLUSTERS, 1)
+        groups = np.add.reduceat(scores, np.arange(0, len(scores), size), axis=0)
+        total += groups.T @ groups * len(groups) / max(len(groups) - 1, 1)
+    return total
+
+
+def _residuals(terms: Terms, cuts: Sequence[Windows], fit: BoundedFit) -> Residuals:
+    """Correlations of what is left of the longest record."""
+    lengths = [
+        [(np.asarray(t.record) == r).sum() * c.length for r in range(len(t.u))]
+        for t, c in zip(terms, cuts, strict=True)
+    ]
+    which = int(np.argmax([max(x) for x in lengths]))
+    term, record = terms[which], int(np.argmax(lengths[which]))
+    own = np.asarray(term.record) == record
+    left = np.asarray(_left(term, fit.unknowns, fit.posterior.theta).difference)[own]
+    seen = np.asarray(term.weight)[own] > 0
+    rows = seen.any(axis=2).ravel()
+    error = np.where(seen, left, 0.0).reshape(-1, left.shape[2])
+    error[:, ~seen.any(axis=(0, 1))] = np.nan
+    u = np.asarray(term.u)[record, : len(error)]
+    return correlations(error[rows], u[rows], float(term.dt))
