@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
@@ -150,8 +151,12 @@ def simulate(
         lumped = read_model(model)
         measured = read_record(record, lumped)
         say("simulating")
-        y = run(lumped, measured, initial=initial.value)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", UserWarning)
+            y = run(lumped, measured, initial=initial.value)
         write_response(out, y, float(measured.dt), [s.name for s in lumped.sensors])
+    for warning in said:
+        typer.echo(f"warning: {warning.message}", err=True)
     if not quiet:
         typer.echo(f"{out}: {len(y)} samples of {len(lumped.sensors)} sensors", err=True)
 

@@ -158,9 +158,13 @@ class Truth:
         while end - t > 1e-12:
             if not self.way:
                 self.way = self.decide(t, self.x, k)
-                if self.way:  # away from the event's own zero, from which the speed may come back within a step
+                if (
+                    self.way
+                ):  # away from the event's own zero, from which the speed may come back within a step
                     short = min(1e-4 * self.dt, end - t)
-                    run = solve_ivp(self.derivative, (t, t + short), self.x, args=(k, self.way), method="DOP853")
+                    run = solve_ivp(
+                        self.derivative, (t, t + short), self.x, args=(k, self.way), method="DOP853"
+                    )
                     t, self.x = t + short, run.y[:, -1]
                     continue
             options["first_step"] = end - t

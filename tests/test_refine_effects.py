@@ -51,7 +51,7 @@ def truth(kind, place, parameters, samples, seed=0, noise=0.0):
 
 @pytest.fixture(scope="module")
 def rubbing():
-    return truth("coulomb_friction", (-1, 0), {"force": 3.0}, 4000, noise=0.01)
+    return truth("coulomb_friction", (-1, 0), {"force": 3.0}, 2400, noise=0.01)
 
 
 def check(found, expected, deviations=4.5):
@@ -87,7 +87,7 @@ def test_windows_records_and_absent_sensors(rubbing):
     """Two records, one with one sensor, in windows; what is fixed or tied keeps its value or ratio."""
     half = [
         jaxsid.Record(rubbing.u[a:b], rubbing.y[a:b, c], DT, inputs=("drive",), outputs=names)
-        for a, b, c, names in ((0, 2000, [0, 1], ("s0", "s1")), (2000, 4000, [1], ("s1",)))
+        for a, b, c, names in ((0, 1200, [0, 1], ("s0", "s1")), (1200, 2400, [1], ("s1",)))
     ]
     model = chain([between("coulomb_friction", ("ground", "b1"), force=2.0)], wrong=0.0)
     found = jaxsid.refine(model, half, window=0.5, fixed=["*.mass"], tied=[["c1.damping", "c2.damping"]])

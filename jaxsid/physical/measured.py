@@ -74,6 +74,10 @@ def response_weights(ir: ImpulseResponse, noise: object | None, left: Array | No
     shape = ir.h.shape
     if noise is None:
         level = jnp.sqrt(jnp.mean((ir.h if left is None else left) ** 2, axis=(0, 2)))
+        # what an exact response leaves is rounding, which differs from fit to fit
+        level = jnp.maximum(
+            level, 100 * jnp.finfo(level.dtype).eps * jnp.sqrt(jnp.mean(ir.h**2, axis=(0, 2)))
+        )
         variance = jnp.broadcast_to(level[:, None] ** 2, shape)
         return Weights(_inverse_root(variance, ir.h), None)
     if hasattr(noise, "autocovariance"):

@@ -80,6 +80,7 @@ def _settled(
 ) -> tuple[Terms, list[Windows], Array]:
     """The records with windows and noise that agree with the model fitted to them, and its unknowns."""
     cuts, theta = window_length(model, records, window), nominal_unknowns(known)
+    begun: tuple[Array, ...] = ()
     short = window_length(model, records, PERIODS / lowest_frequency(model))
     if np.isfinite(lowest_frequency(model)) and any(
         cut.length > 2 * x.length for cut, x in zip(cuts, short, strict=True)
@@ -88,9 +89,11 @@ def _settled(
         say("a start from short windows")
         parts = tuple(motion_term(model, records, cut, rest=False) for cut in short)
         theta = _fitted(known, parts, theta)
+        begun = tuple(_begun(part, known.unknowns, theta) for part in parts)
     for remaining in reversed(range(ROUNDS)):
         say("windows and initial states")
         terms = tuple(motion_term(model, records, cut, rest=rest) for cut in cuts)
+        terms = tuple(_from_states(t, x) for t, x in zip(terms, begun, strict=True)) if begun else terms
         for _ in range(ROUNDS):
             say("level and colour of the noise")
             theta = _fitted(known, terms, theta)
@@ -103,6 +106,18 @@ def _settled(
             break
         cuts = better
     return terms, cuts, theta
+
+
+def _begun(term: MotionTerm, unknowns: LinearMatrices, theta: Array) -> Array:
+    """Initial states of the records, those of their first windows."""
+    return _left(term, unknowns, theta).states[np.asarray(term.first) == 0]
+
+
+def _from_states(term: MotionTerm, states: Array) -> MotionTerm:
+    """The term with other initial states to begin with, where its windows are whole records from any state."""
+    return (
+        eqx.tree_at(lambda t: t.state, term, states) if term.free and len(states) == len(term.state) else term
+    )
 
 
 def _fitted(known: Restricted, terms: Terms, start: Array) -> Array:
@@ -126,7 +141,8 @@ def _weighed(terms: Terms, cuts: Sequence[Windows], unknowns: LinearMatrices, th
     """Level and colour of the noise of every sensor from what a fit left; the colour of whole records only."""
     found = []
     for term, cut in zip(terms, cuts, strict=True):
-        left, seen = np.asarray(_left(term, unknowns, theta).difference), np.asarray(term.weight) > 0
+        after = _left(term, unknowns, theta)
+        left, seen = np.asarray(after.difference), np.asarray(term.weight) > 0
         weight, color = np.zeros(seen.shape), np.array(term.color)
         for output in range(left.shape[2]):
             here = seen[:, :, output]
@@ -139,7 +155,8 @@ def _weighed(terms: Terms, cuts: Sequence[Windows], unknowns: LinearMatrices, th
                 error = sum(c * np.roll(error, k, axis=1) for k, c in enumerate(color[output]))
             level = np.sqrt((np.asarray(error)[here] ** 2).mean())
             weight[:, :, output] = here / max(level, 1e-12 * size, np.finfo(float).tiny)
-        found.append(eqx.tree_at(lambda t: (t.weight, t.color), term, (as_array(weight), as_array(color))))
+        known = as_array(weight), as_array(color), after.states
+        found.append(eqx.tree_at(lambda t: (t.weight, t.color, t.state), term, known))
     return tuple(found)
 
 

@@ -20,6 +20,7 @@ from jaxsid.records import ContinuousModel, ImpulseResponse, Realization, Record
 
 # Correlation lags of ERA/DC: few, since the window of the in-band response already spans the slowest period.
 LAGS = 5
+ROUNDING = 1e-18  # part of the power of a line that no fit can explain
 CLEARLY = 0.1  # less noise, in logarithm, before a growing pole is believed
 RATE_ROUNDS = 8  # of bringing records to a common rate by a model, each several times nearer than the last
 SETTLED = 1e-3  # of the noise: a change of a line that the model no longer feels
@@ -86,22 +87,18 @@ def state_space(
     diagram = _diagram(response, max(expected, order_used))
     candidates = [np.linalg.eigvals(np.asarray(raw.A)), _larger(diagram, 2 * order_used, response)]
     growing, stable = _growing(candidates, lines), True
-    polished = polish(needed_poles(candidates, lines, order_used), lines)
+    polished, given = polish(needed_poles(candidates, lines, order_used), lines), lines
+    polished, lines = _settled(polished, given, stable=True)
     if len(growing) > 0:
         free = polish(needed_poles(candidates, lines, order_used, stable=False), lines, stable=False)
         if _noise_gain(polished, free, lines) > CLEARLY:
-            polished, stable = free, False
+            polished, lines = _settled(free, given, stable=False)
+            stable = False
     if not np.isfinite(polished.realization.A).all():
         raise InsufficientDataError(
             f"no model of order {order_used} fits the records: the refinement of the poles diverged. Lower the "
             "order, widen the band of the excitation, or lengthen the record."
         )
-    given = lines
-    for _ in range(RATE_ROUNDS if len(set(given.record_dt)) > 1 else 0):
-        before, lines = lines, _common_rate(given, polished.realization)
-        polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines, stable=stable)
-        if np.all(np.abs(lines.y - before.y) < SETTLED * np.asarray(polished.noise)):
-            break
     measured = raw
     if not _holds(raw, polished.realization):
         measured = _realize(response, min(2 * order_used, int(diagram.order.max())), realization)
@@ -179,10 +176,26 @@ def _growing(candidates: Sequence[np.ndarray], lines: Lines) -> np.ndarray:
     return s[inside & twice & (s.real * longest > np.log(GROWTH)) & (s.imag >= 0)]
 
 
+def _settled(polished: Polished, given: Lines, *, stable: bool) -> tuple[Polished, Lines]:
+    """The fit and the lines at the common rate of records of different rates, which each follow from the other."""
+    lines = given
+    for _ in range(RATE_ROUNDS if len(set(given.record_dt)) > 1 else 0):
+        if not np.isfinite(polished.realization.A).all():
+            break
+        before, lines = lines, _common_rate(given, polished.realization)
+        polished = polish(np.linalg.eigvals(np.asarray(polished.realization.A)), lines, stable=stable)
+        if np.all(np.abs(lines.y - before.y) < SETTLED * np.asarray(polished.noise)):
+            break
+    return polished, lines
+
+
 def _noise_gain(one: Polished, other: Polished, lines: Lines) -> float:
-    """By how much the other fit leaves less noise, mean logarithm over lines and outputs."""
+    """By how much the other fit leaves less noise, mean logarithm over lines and outputs; rounding is none."""
     used = np.asarray(lines.weight) > 0
-    return float(np.mean((np.log(np.asarray(one.noise)) - np.log(np.asarray(other.noise)))[used]))
+    size = np.abs(np.asarray(lines.y)) ** 2
+    floor = ROUNDING * size.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+    one_log, other_log = (np.log(np.maximum(np.asarray(x.noise), floor)) for x in (one, other))
+    return float(np.mean((one_log - other_log)[used]))
 
 
 def _unstable(poles: np.ndarray) -> tuple[str, ...]:
