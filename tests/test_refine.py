@@ -211,6 +211,9 @@ def test_solvers_of_optimistix_come_to_the_same_place():
         np.testing.assert_allclose(other.theta, own.theta, rtol=1e-6)
         np.testing.assert_allclose(other.information, own.information, rtol=1e-5)
         np.testing.assert_allclose(other.squares, own.squares, rtol=1e-8)
+    priors = {"b1.mass": (1.3, 0.01)}
+    whole = refine(model, ir, noise=noise, priors=priors, validate=False, solver=solver)
+    np.testing.assert_allclose(whole.elements.values, known.unknowns.values(own.theta), rtol=1e-6)
 
 
 def recorded(seed, model, outputs=(0, 1, 2)):

@@ -23,6 +23,7 @@ from jaxsid.physical.parameterization import Matrix
 from jaxsid.records import SecondOrderModel
 
 ROUNDS = 2  # of the search for the initial states, beside the last linear one
+SHORTER = 0.25  # part of a step that did not help
 BLIND_STATE = 1e-9  # of scaled J'J: directions of an initial state that leave no trace
 
 
@@ -80,7 +81,7 @@ class MotionTerm(eqx.Module):
 
     @property
     def equations(self) -> Array:
-        return (_counted(self.weight, self.color) > 0).sum()
+        return (counted(self.weight, self.color) > 0).sum()
 
     def left(self, unknowns: LinearMatrices, theta: Array) -> "Left":
         """What the model leaves of every window, its initial state the best one.
@@ -90,11 +91,20 @@ class MotionTerm(eqx.Module):
             theta: unknowns.
         """
 
-        def improved(_: Array, states: Array) -> Array:
-            r, j, _ = self._slopes(unknowns, theta, states, jnp.zeros((len(theta), 0), theta.dtype))
-            return states - self._moved(_product(_pseudo_inverse(j), r))
+        def improved(_: Array, found: tuple) -> tuple:
+            states, move, cost, part = found
+            candidate = states - self._moved(part[:, None] * move)
+            r, j, _ = self._slopes(unknowns, theta, candidate, jnp.zeros((len(theta), 0), theta.dtype))
+            cost_new = (r**2).sum(axis=1)
+            better = (cost_new < cost)[:, None]
+            move = jnp.where(better, _product(_pseudo_inverse(j), r), move)
+            part = jnp.where(better[:, 0], 1.0, SHORTER * part)
+            return jnp.where(better, candidate, states), move, jnp.minimum(cost, cost_new), part
 
-        states = lax.fori_loop(0, ROUNDS, improved, self.state)
+        windows, free = len(self.state), len(self.free)
+        nothing = jnp.zeros((windows, free), theta.dtype)
+        start = (self.state, nothing, jnp.full(windows, jnp.inf), jnp.ones(windows, theta.dtype))
+        states = lax.fori_loop(0, 2 * ROUNDS, improved, start)[0]
         return Left(self.simulated(unknowns, theta, states) - self.y, states)
 
     def projected(self, unknowns: LinearMatrices, theta: Array) -> tuple[Array, Array]:
@@ -106,16 +116,23 @@ class MotionTerm(eqx.Module):
         """
         every = jnp.eye(len(theta), dtype=theta.dtype)
 
-        # all rounds are of one kind, so that the simulation is compiled once
+        # all rounds are of one kind, so that the simulation is compiled once; a step that does not help is cut short
         def improved(_: Array, found: tuple) -> tuple:
-            states = found[0] - self._moved(_product(found[4], found[1]))
-            r, j, slopes = self._slopes(unknowns, theta, states, every)
-            return states, r, j, slopes, _pseudo_inverse(j)
+            states, r, j, slopes, inverse, cost, part = found
+            candidate = states - self._moved(part[:, None] * _product(inverse, r))
+            r_new, j_new, slopes_new = self._slopes(unknowns, theta, candidate, every)
+            cost_new = (r_new**2).sum(axis=1)
+            better = cost_new < cost
+            new = (candidate, r_new, j_new, slopes_new, _pseudo_inverse(j_new), cost_new, jnp.ones_like(part))
+            old = (states, r, j, slopes, inverse, cost, SHORTER * part)
+            keep = lambda x, y: jnp.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y)  # noqa: E731
+            return tuple(map(keep, new, old))
 
         windows, size = len(self.state), self.y[0].size
         shapes = (size,), (size, len(self.free)), (size, len(theta)), (len(self.free), size)
         nothing = (jnp.zeros((windows, *x), theta.dtype) for x in shapes)
-        _, r, j, slopes, inverse = lax.fori_loop(0, ROUNDS + 1, improved, (self.state, *nothing))
+        start = (self.state, *nothing, jnp.full(windows, jnp.inf), jnp.ones(windows, theta.dtype))
+        _, r, j, slopes, inverse, _, _ = lax.fori_loop(0, ROUNDS + 1, improved, start)
         r = r - jnp.einsum("wkn,wn->wk", j, _product(inverse, r))
         return r, slopes - jnp.einsum("wkn,wnp->wkp", j, jnp.einsum("wnk,wkp->wnp", inverse, slopes))
 
@@ -178,7 +195,7 @@ class MotionTerm(eqx.Module):
         r = jnp.where(self.weight > 0, left, 0.0)
         taps = self.color.shape[1]
         white = sum(self.color[:, k] * jnp.roll(r, k, axis=1) for k in range(taps))
-        return (white * _counted(self.weight, self.color)).reshape(len(r), -1)
+        return (white * counted(self.weight, self.color)).reshape(len(r), -1)
 
 
 def _product(inverse: Float[Array, "windows n k"], r: Float[Array, "windows k"]) -> Float[Array, "windows n"]:
@@ -192,8 +209,13 @@ class Left(NamedTuple):
     states: Float[Array, "windows n"]
 
 
-def _counted(weight: Array, color: Array) -> Array:
-    """Weights, 0 where a filter of this length would reach beyond the window or over a gap."""
+def counted(weight: Array, color: Array) -> Array:
+    """Weights, 0 where a filter of this length would reach beyond the window or over a gap.
+
+    Args:
+        weight: (windows, length, outputs).
+        color: (outputs, taps).
+    """
     return jnp.stack([jnp.roll(weight, k, axis=1) for k in range(color.shape[1])]).min(axis=0) * (
         jnp.arange(weight.shape[1])[:, None] >= color.shape[1] - 1
     )

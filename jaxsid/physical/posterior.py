@@ -212,7 +212,9 @@ class BoundedFit(NamedTuple):
     at_bound: Bool[np.ndarray, " p"]
 
 
-def within_bounds(terms: tuple[Data, ...], known: Restricted, start: Array) -> BoundedFit:
+def within_bounds(
+    terms: tuple[Data, ...], known: Restricted, start: Array, solver: Solver | None = None
+) -> BoundedFit:
     """The mode of the posterior within the bounds, exact for those that hold: an active-set method.
 
     Where the free mode lies outside, what it exceeds is held at the bounds and the rest fitted anew; bounds that are
@@ -223,25 +225,28 @@ def within_bounds(terms: tuple[Data, ...], known: Restricted, start: Array) -> B
         terms: the data.
         known: unknowns, bounds, priors.
         start: (p,) unknowns to begin with.
+        solver: as of `most_probable`.
     """
     free, scale = known.unknowns, np.asarray(known.unknowns.scale)
     lower, upper = known.lower / scale, known.upper / scale
-    found = most_probable(terms, free, known.prior, jnp.asarray(np.clip(np.asarray(start), lower, upper)))
+    begin = jnp.asarray(np.clip(np.asarray(start), lower, upper))
+    found = most_probable(terms, free, known.prior, begin, solver)
     at = np.asarray(found.theta)
     outside = (at < lower) | (at > upper)
     if not np.isfinite(at).all() or not outside.any():
         return BoundedFit(found, free, np.zeros(len(at), bool))
-    fit, settled = _with_active_bounds(terms, known, at, outside)
+    fit, settled = _with_active_bounds(terms, known, at, outside, solver)
     if settled:
         return fit
     at = np.clip(at, lower, upper)
     at = np.asarray(_bounded(terms, free, known.prior, *(jnp.asarray(x) for x in (at, lower, upper))))
-    searched, settled = _with_active_bounds(terms, known, at, (at - lower < NEAR) | (upper - at < NEAR))
+    near = (at - lower < NEAR) | (upper - at < NEAR)
+    searched, settled = _with_active_bounds(terms, known, at, near, solver)
     return searched if settled or searched.posterior.squares < fit.posterior.squares else fit
 
 
 def _with_active_bounds(
-    terms: tuple[Data, ...], known: Restricted, start: np.ndarray, held: np.ndarray
+    terms: tuple[Data, ...], known: Restricted, start: np.ndarray, held: np.ndarray, solver: Solver | None
 ) -> tuple[BoundedFit, bool]:
     """The mode with some unknowns at their bounds, these changed until all pull outwards; whether they were."""
     free, scale = known.unknowns, np.asarray(known.unknowns.scale)
@@ -250,7 +255,7 @@ def _with_active_bounds(
         at = np.clip(at, lower, upper)
         unknowns = free.held(held, at * scale)
         weight = np.where(held, 0.0, np.asarray(known.prior.weight))
-        found = most_probable(terms, unknowns, Prior(known.prior.mean, weight), jnp.asarray(at))
+        found = most_probable(terms, unknowns, Prior(known.prior.mean, weight), jnp.asarray(at), solver)
         at = np.where(held, at, np.asarray(found.theta))
         fit = BoundedFit(found._replace(theta=jnp.asarray(at)), unknowns, held)
         outside = (at < lower) | (at > upper)

@@ -135,6 +135,7 @@ def _collect(
         warnings=(
             *_about_records(records, lines),
             *space.warnings,
+            *_left_out(model),
             *found.warnings,
             *_missing(model, system),
         ),
@@ -216,3 +217,13 @@ def _check_records(model: LumpedModel, records: Sequence[Record], order: int) ->
         raise InsufficientDataError(
             f"{samples} samples cannot determine a model of {order} states: record at least {needed}."
         )
+
+
+def _left_out(model: LumpedModel) -> tuple[str, ...]:
+    if not model.effects:
+        return ()
+    kinds = ", ".join(dict.fromkeys(effect.kind for effect in model.effects))
+    return (
+        f"The model has effects ({kinds}), which a linear model cannot have: they are left out here, and what they do "
+        "is spread over mass, damping and stiffness. `jaxsid.refine` fits them.",
+    )

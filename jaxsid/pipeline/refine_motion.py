@@ -1,6 +1,6 @@
 """Refinement of a model with effects against raw records, by simulation in time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,21 +11,21 @@ from jaxsid.compilation import compiled
 from jaxsid.impulse.whitening import whitening_filter
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import LinearMatrices, element_matrices, with_values
-from jaxsid.physical.motion import Left, MotionTerm
+from jaxsid.physical.motion import Left, MotionTerm, counted
 from jaxsid.physical.posterior import BoundedFit
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.motion_terms import Windows, lowest_frequency, motion_term, window_length
-from jaxsid.pipeline.refining import Problem, concluded, nominal_unknowns, solved
+from jaxsid.pipeline.refining import Manner, Problem, concluded, nominal_unknowns, solved
 from jaxsid.records import Record, as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
 ROUNDS = 2  # fits after which level and colour of the noise, and then the windows, are found anew
 SAME = 0.1  # relative change of a window that is none
+STATE_ROUNDS = 2  # fits of short windows before their initial states are taken for found
 PERIODS = 2  # of the slowest vibration, in a window to start with
 CLUSTERS = 30  # groups of windows whose errors are taken for independent
-Say = Callable[[str], None]
 Terms = tuple[MotionTerm, ...]
 
 
@@ -35,16 +35,15 @@ def refine_motion(
     records: tuple[Record, ...],
     window: float | None,
     initial: str,
-    validate: bool,
-    say: Say,
+    how: Manner,
 ) -> Refinement:
-    terms, cuts, theta = _settled(model, known, records, window, initial == "rest", say)
-    say("values of the model and its effects")
-    early = tuple(_held_out(term, late=False) for term in terms) if validate else None
+    terms, cuts, theta = _settled(model, known, records, window, initial == "rest", how)
+    how.say("values of the model and its effects")
+    early = tuple(_held_out(term, late=False) for term in terms) if how.validate else None
     nuisances = sum(len(term.free) * len(term.state) for term in terms)
-    problem = Problem(known, terms, early, (theta,), nuisances)
+    problem = Problem(known, terms, early, (theta,), nuisances, solver=how.solver)
     fit, before = solved(problem)
-    say("validation")
+    how.say("validation")
 
     def errors(m: LumpedModel, of: Terms = terms, seen: Terms = terms) -> np.ndarray:
         values = jnp.asarray(element_matrices(m, effects=True).nominal)
@@ -76,7 +75,7 @@ def _settled(
     records: tuple[Record, ...],
     window: float | None,
     rest: bool,
-    say: Say,
+    how: Manner,
 ) -> tuple[Terms, list[Windows], Array]:
     """The records with windows and noise that agree with the model fitted to them, and its unknowns."""
     cuts, theta = window_length(model, records, window), nominal_unknowns(known)
@@ -86,17 +85,20 @@ def _settled(
         cut.length > 2 * x.length for cut, x in zip(cuts, short, strict=True)
     ):
         # a long simulation by wrong values has many misleading minima, a short one none
-        say("a start from short windows")
+        how.say("a start from short windows")
         parts = tuple(motion_term(model, records, cut, rest=False) for cut in short)
-        theta = _fitted(known, parts, theta)
+        for _ in range(STATE_ROUNDS):
+            theta = _fitted(known, parts, theta, how)
+            parts = tuple(_from_best_states(part, known.unknowns, theta) for part in parts)
+        theta = _fitted(known, parts, theta, how)
         begun = tuple(_begun(part, known.unknowns, theta) for part in parts)
     for remaining in reversed(range(ROUNDS)):
-        say("windows and initial states")
+        how.say("windows and initial states")
         terms = tuple(motion_term(model, records, cut, rest=rest) for cut in cuts)
         terms = tuple(_from_states(t, x) for t, x in zip(terms, begun, strict=True)) if begun else terms
         for _ in range(ROUNDS):
-            say("level and colour of the noise")
-            theta = _fitted(known, terms, theta)
+            how.say("level and colour of the noise")
+            theta = _fitted(known, terms, theta, how)
             terms = _weighed(terms, cuts, known.unknowns, theta)
         # where the windows follow from the model, those of the fitted one count
         better = window_length(with_values(model, known.unknowns.values(theta)), records, window)
@@ -106,6 +108,18 @@ def _settled(
             break
         cuts = better
     return terms, cuts, theta
+
+
+def _from_best_states(term: MotionTerm, unknowns: LinearMatrices, theta: Array) -> MotionTerm:
+    """The term with better initial states to begin with: those found, or rest where that leads to less misfit.
+
+    Of a contact at rest the motion depends on its speed by the square, so that a search from elsewhere creeps there.
+    """
+    nothing = eqx.tree_at(lambda t: t.state, term, jnp.zeros_like(term.state))
+    found, still = (_left(x, unknowns, theta) for x in (term, nothing))
+    misfit, misfit_still = (((x.difference * term.weight) ** 2).sum(axis=(1, 2)) for x in (found, still))
+    best = jnp.where((misfit_still < misfit)[:, None], still.states, found.states)
+    return eqx.tree_at(lambda t: t.state, term, best)
 
 
 def _begun(term: MotionTerm, unknowns: LinearMatrices, theta: Array) -> Array:
@@ -120,8 +134,8 @@ def _from_states(term: MotionTerm, states: Array) -> MotionTerm:
     )
 
 
-def _fitted(known: Restricted, terms: Terms, start: Array) -> Array:
-    fit, _ = solved(Problem(known, terms, None, (start,), weighed=False))
+def _fitted(known: Restricted, terms: Terms, start: Array, how: Manner) -> Array:
+    fit, _ = solved(Problem(known, terms, None, (start,), weighed=False, solver=how.solver))
     return fit.posterior.theta
 
 
@@ -141,6 +155,7 @@ def _weighed(terms: Terms, cuts: Sequence[Windows], unknowns: LinearMatrices, th
     """Level and colour of the noise of every sensor from what a fit left; the colour of whole records only."""
     found = []
     for term, cut in zip(terms, cuts, strict=True):
+        term = _from_best_states(term, unknowns, theta)
         after = _left(term, unknowns, theta)
         left, seen = np.asarray(after.difference), np.asarray(term.weight) > 0
         weight, color = np.zeros(seen.shape), np.array(term.color)
@@ -173,11 +188,11 @@ def _held_out(term: MotionTerm, *, late: bool) -> MotionTerm:
 def _errors(of: Terms, seen: Terms, unknowns: LinearMatrices, theta: Array) -> np.ndarray:
     """rms(y - yhat) / rms(y) of every output, where the first terms count, begun as the second ones tell."""
     left = size = 0.0
-    for counted, given in zip(of, seen, strict=True):
-        weight = np.asarray(counted.weight) > 0
+    for which, given in zip(of, seen, strict=True):
+        weight = np.asarray(counted(which.weight, which.color)) > 0
         difference = np.asarray(_left(given, unknowns, theta).difference)
         left = left + np.where(weight, difference**2, 0.0).sum(axis=(0, 1))
-        size = size + np.where(weight, np.asarray(counted.y) ** 2, 0.0).sum(axis=(0, 1))
+        size = size + np.where(weight, np.asarray(which.y) ** 2, 0.0).sum(axis=(0, 1))
     return np.sqrt(left / np.where(np.asarray(size) > 0, size, 1.0))
 
 

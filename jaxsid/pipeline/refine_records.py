@@ -1,6 +1,6 @@
 """Refinement against raw records, through the Fourier lines that their inputs excite."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -15,14 +15,13 @@ from jaxsid.physical.terms import LineTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.matrices import sensed_rows
-from jaxsid.pipeline.refining import Problem, concluded, fitted_model, nominal_unknowns, solved
+from jaxsid.pipeline.refining import Manner, Problem, concluded, fitted_model, nominal_unknowns, solved
 from jaxsid.pipeline.setting import setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
 from jaxsid.records import Record, as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
-Say = Callable[[str], None]
 Pair = tuple[float, float]
 
 
@@ -31,10 +30,9 @@ def refine_records(
     known: Restricted,
     records: tuple[Record, ...],
     band: Pair | None,
-    validate: bool,
-    say: Say,
+    how: Manner,
 ) -> Refinement:
-    system = setting(model, records)
+    system, say = setting(model, records), how.say
     say("poles and noise in the excited band")
     lines = record_lines(records, outputs=system.outputs, band=band)
     space = state_space(records, lines, order=None, expected=system.visible)
@@ -49,13 +47,13 @@ def refine_records(
     every = LineTerm(_target(space, space.lines, np.asarray(space.polished.noise)), sensed)
     early, late = zip(*(_split(r) for r in records), strict=True)
     train = None
-    if validate:
+    if how.validate:
         low, high = np.asarray(space.lines.band).tolist()
         first = _padded(record_lines(early, outputs=system.outputs, band=(low, high)), len(space.lines.z))
         train = (LineTerm(_target(space, first, _noise_on(first, space)), sensed),)
     say("mass, damping and stiffness")
     nuisances = len(records) * (2 * len(model.bodies) + 1) * len(system.outputs)
-    problem = Problem(known, (every,), train, (near, nominal_unknowns(known)), nuisances)
+    problem = Problem(known, (every,), train, (near, nominal_unknowns(known)), nuisances, solver=how.solver)
     fit, before = solved(problem)
     say("validation")
 

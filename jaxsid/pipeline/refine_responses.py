@@ -1,7 +1,5 @@
 """Refinement against impulse responses and frequency responses."""
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -15,11 +13,12 @@ from jaxsid.mechanics.simulate import markov_parameters
 from jaxsid.physical.cbsi import visible_states
 from jaxsid.physical.elements import ElementValues, with_values
 from jaxsid.physical.measured import every_other, frequency_term, response_term, response_weights
-from jaxsid.physical.posterior import BoundedFit, most_probable
+from jaxsid.physical.posterior import BoundedFit, Solver, most_probable
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.physical.terms import ResponseTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.refining import (
+    Manner,
     Problem,
     concluded,
     fitted_model,
@@ -32,16 +31,18 @@ from jaxsid.records import ImpulseResponse, SecondOrderModel, as_array
 from jaxsid.refinement import Refinement, Validation
 from jaxsid.uncertainty.noise import CorrelatedNoise, ResponseNoise
 
-Say = Callable[[str], None]
-
 
 def refine_traced(
-    model: LumpedModel, known: Restricted, ir: ImpulseResponse, noise: ResponseNoise | None
+    model: LumpedModel,
+    known: Restricted,
+    ir: ImpulseResponse,
+    noise: ResponseNoise | None,
+    solver: Solver | None,
 ) -> Refinement:
     """The fit alone, for use under transformations."""
     term = response_term(ir, second_order(model), response_weights(ir, noise))
     unknowns, prior = known.unknowns, known.prior
-    found = most_probable((term,), unknowns, prior, nominal_unknowns(known))
+    found = most_probable((term,), unknowns, prior, nominal_unknowns(known), solver)
     free = max(known.unknowns.mix.shape[1], 1)
     misfit = found.squares / jnp.maximum(found.equations - free, 1)
     precision = jnp.diag(jnp.asarray(prior.weight) ** 2)
@@ -79,24 +80,23 @@ def refine_response(
     known: Restricted,
     ir: ImpulseResponse,
     noise: ResponseNoise | None,
-    validate: bool,
-    say: Say,
+    how: Manner,
 ) -> Refinement:
     sensed = second_order(model)
-    say("a start from the response")
+    how.say("a start from the response")
     starts = (*_realized_start(model, known, ir, sensed), nominal_unknowns(known))
     used = every_other(len(ir.h))
-    train = lambda w: (response_term(ir, sensed, w, used if validate else None),)  # noqa: E731
+    train = lambda w: (response_term(ir, sensed, w, used if how.validate else None),)  # noqa: E731
     weights = response_weights(ir, noise)
     if noise is None:
-        say("the level of the noise")
-        rough, _ = solved(Problem(known, train(weights), None, starts, weighed=False))
+        how.say("the level of the noise")
+        rough, _ = solved(Problem(known, train(weights), None, starts, weighed=False, solver=how.solver))
         starts = (rough.posterior.theta,)
         left = ir.h - _response_of(fitted_model(model, rough), ir)
         weights = response_weights(ir, None, left)
-    say("mass, damping and stiffness")
+    how.say("mass, damping and stiffness")
     every = (response_term(ir, sensed, weights),)
-    problem = Problem(known, every, train(weights) if validate else None, starts)
+    problem = Problem(known, every, train(weights) if how.validate else None, starts, solver=how.solver)
     fit, before = solved(problem)
     outputs = tuple(s.name for s in model.sensors)
 
@@ -153,8 +153,7 @@ def refine_frequencies(
     known: Restricted,
     response: FrequencyResponse,
     dt: ArrayLike | None,
-    validate: bool,
-    say: Say,
+    how: Manner,
 ) -> Refinement:
     sensed, hold = second_order(model), tuple(i.hold for i in model.inputs)
     require(
@@ -165,9 +164,9 @@ def refine_frequencies(
     interval = None if "band" in hold else dt
     used = every_other(len(response.frequencies))
     every = frequency_term(response, sensed, interval, hold)
-    train = (frequency_term(response, sensed, interval, hold, used),) if validate else None
-    say("mass, damping and stiffness")
-    problem = Problem(known, (every,), train, (nominal_unknowns(known),))
+    train = (frequency_term(response, sensed, interval, hold, used),) if how.validate else None
+    how.say("mass, damping and stiffness")
+    problem = Problem(known, (every,), train, (nominal_unknowns(known),), solver=how.solver)
     fit, before = solved(problem)
     H = np.asarray(response.H)
 

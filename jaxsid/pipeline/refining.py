@@ -18,7 +18,7 @@ from jaxsid.physical.elements import (
     with_values,
 )
 from jaxsid.physical.parameterization import BLIND
-from jaxsid.physical.posterior import BoundedFit, Data, squares_at, within_bounds
+from jaxsid.physical.posterior import BoundedFit, Data, Solver, squares_at, within_bounds
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.matrices import GOOD, POOR
 from jaxsid.records import as_array
@@ -27,6 +27,20 @@ from jaxsid.refinement import Refinement, Residuals, Validation
 FAINT = 0.01  # part of a combination, next to its largest, that is not named
 Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
 Spread = Callable[[BoundedFit], np.ndarray]  # covariance of J'r, where it is not J'J
+
+
+class Manner(NamedTuple):
+    """How a refinement goes about it.
+
+    Attributes:
+        validate: whether a part of the data is kept from a first fit.
+        say: called with a line of text as each stage begins.
+        solver: of optimistix; None for this library's own.
+    """
+
+    validate: bool
+    say: Callable[[str], None]
+    solver: Solver | None
 
 
 class Problem(NamedTuple):
@@ -39,6 +53,7 @@ class Problem(NamedTuple):
         starts: unknowns to begin with, the most promising first.
         nuisances: number of unknowns, such as those of transients, that the terms project out.
         weighed: whether the level of the noise is known, so that a fit can be told to be good.
+        solver: as in `Manner`.
     """
 
     known: Restricted
@@ -47,6 +62,7 @@ class Problem(NamedTuple):
     starts: tuple[Array, ...]
     nuisances: int = 0
     weighed: bool = True
+    solver: Solver | None = None
 
 
 def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
@@ -56,7 +72,7 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     for start in problem.starts:
         if len(problem.starts) > 1 and not np.isfinite(float(squares_at(first, known.unknowns, start))):
             continue
-        fit = within_bounds(first, known, start)
+        fit = within_bounds(first, known, start, problem.solver)
         squares = float(fit.posterior.squares)
         if not np.isfinite(squares):
             continue
@@ -72,7 +88,7 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     _check_told(known, best)
     if problem.train is None:
         return best, None
-    return within_bounds(problem.every, known, best.posterior.theta), best
+    return within_bounds(problem.every, known, best.posterior.theta, problem.solver), best
 
 
 def _check_told(known: Restricted, fit: BoundedFit) -> None:
