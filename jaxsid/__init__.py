@@ -29,7 +29,13 @@ if TYPE_CHECKING:
     from jaxsid.mechanics.first_order import physical_displacement_velocity as physical_displacement_velocity
     from jaxsid.mechanics.hold import continuous as continuous
     from jaxsid.mechanics.hold import discretise as discretise
+    from jaxsid.mechanics.lumped import Connection as Connection
+    from jaxsid.mechanics.lumped import Effect as Effect
+    from jaxsid.mechanics.lumped import Input as Input
     from jaxsid.mechanics.lumped import LumpedModel as LumpedModel
+    from jaxsid.mechanics.lumped import Matrices as Matrices
+    from jaxsid.mechanics.lumped import Sensor as Sensor
+    from jaxsid.mechanics.lumped import Tolerance as Tolerance
     from jaxsid.mechanics.lumped import lumped_model as lumped_model
     from jaxsid.mechanics.lumped import second_order as second_order
     from jaxsid.mechanics.pencil import complex_modes as complex_modes
@@ -88,7 +94,17 @@ _HOMES = {
         "physical_displacement_velocity",
     ),
     "jaxsid.mechanics.hold": ("continuous", "discretise"),
-    "jaxsid.mechanics.lumped": ("LumpedModel", "lumped_model", "second_order"),
+    "jaxsid.mechanics.lumped": (
+        "Connection",
+        "Effect",
+        "Input",
+        "LumpedModel",
+        "Matrices",
+        "Sensor",
+        "Tolerance",
+        "lumped_model",
+        "second_order",
+    ),
     "jaxsid.mechanics.pencil": ("complex_modes",),
     "jaxsid.mechanics.simulate": ("markov_parameters", "simulate", "simulate_linear"),
     "jaxsid.modes": ("modal", "modal_realization"),

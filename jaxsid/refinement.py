@@ -55,7 +55,9 @@ class Refinement(eqx.Module):
         covariance: (e, e) of the values, SI units; rows of what is not determined are NaN.
         data_share: (e,) part of what is known of each value that comes from the data, the rest from its prior; 1
             without prior, NaN where fixed.
-        misfit: mean square of the weighted residual; 1 when the model explains all but noise.
+        misfit: mean square of the weighted residual; 1 when the model explains all but noise. Where the noise was
+            estimated from what a fit left, as by simulation in time, it is near 1 whatever the model lacks: look at
+            `residuals` and `validation` then.
         outputs: names of the outputs below.
         before, after: (outputs,) rms(y - yhat) / rms(y) of the nominal and the refined model over all data.
         validation: on data that were held out, None without.

@@ -32,7 +32,7 @@ def chain(effects, wrong=1.0, seed=3):
 
 
 def between(kind, place, **parameters):
-    return Effect(kind, (("between", place),), {k: jnp.asarray(v) for k, v in parameters.items()})
+    return Effect(kind, (("between", place),), parameters)
 
 
 def truth(kind, place, parameters, samples, seed=0, noise=0.0):

@@ -90,14 +90,17 @@ def holding(
         gain: relative accelerations if nothing held.
         give: what a unit of each force takes off each acceleration.
     """
-    acting, most = _acting(kinds), slips(kinds, parameters, jnp.zeros_like(gain))
+    acting = _acting(kinds)
+    if not acting:
+        return jnp.zeros_like(gain)
+    most = slips(kinds, parameters, jnp.zeros_like(gain))
     own = jnp.diag(give)
     held = (own > 0) & rubbing(kinds) & resting
     own = jnp.where(held, own, 1.0)
     off = give - jnp.diag(jnp.diag(give))
 
     def sweep(_: Array | int, force: Array) -> Array:
-        for i in range(len(force)):
+        for i in acting:
             force = force.at[i].set(
                 jnp.clip((gain[i] - off[i] @ force) / own[i], -most[i], most[i]) * held[i]
             )

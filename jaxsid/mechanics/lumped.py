@@ -1,7 +1,7 @@
 """Lumped mechanical models: bodies, the springs and dampers between them, inputs and sensors."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,6 +51,10 @@ class Connection(NamedTuple):
     between: tuple[str, str]
 
 
+def _arrays(numbers: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    return {name: floating(value) for name, value in numbers.items()}
+
+
 class Effect(eqx.Module):
     """A law beyond the linear model, such as friction.
 
@@ -62,7 +66,7 @@ class Effect(eqx.Module):
 
     kind: str = eqx.field(static=True)
     place: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-    parameters: dict[str, Array]
+    parameters: dict[str, Array] = eqx.field(converter=_arrays)
 
 
 class Matrices(eqx.Module):
