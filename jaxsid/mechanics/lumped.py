@@ -18,7 +18,14 @@ GROUND = "ground"
 
 
 class Input(NamedTuple):
-    """A force or torque on one body, held between samples as "zero", "first" or "band" says."""
+    """A force or torque on one body.
+
+    Attributes:
+        name: of the column of records that holds it.
+        body: on which it acts.
+        hold: what it does between samples: "zero" keeps its value, "first" goes straight to the next, "band" has
+            nothing above half the sampling rate.
+    """
 
     name: str
     body: str
@@ -26,7 +33,13 @@ class Input(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """An absolute sensor on one body; kind is "displacement", "velocity" or "acceleration"."""
+    """An absolute sensor on one body.
+
+    Attributes:
+        name: of the column of records that holds it.
+        body: whose motion it reads.
+        kind: "displacement", "velocity" or "acceleration".
+    """
 
     name: str
     body: str
@@ -34,7 +47,11 @@ class Sensor(NamedTuple):
 
 
 class Tolerance(NamedTuple):
-    """Relative standard deviations of the nominal masses, stiffnesses and dampings."""
+    """How well the nominal numbers are known.
+
+    Attributes:
+        mass, stiffness, damping: relative standard deviations of all masses, stiffnesses and dampings.
+    """
 
     mass: float = 0.005
     stiffness: float = 0.005
@@ -45,7 +62,12 @@ NOMINAL = Tolerance()
 
 
 class Connection(NamedTuple):
-    """A spring and viscous damper between two bodies, or between a body and "ground"."""
+    """A spring and viscous damper between two bodies, or between a body and "ground".
+
+    Attributes:
+        name: for messages and results.
+        between: names of the two ends.
+    """
 
     name: str
     between: tuple[str, str]
@@ -70,7 +92,13 @@ class Effect(eqx.Module):
 
 
 class Matrices(eqx.Module):
-    """Mass, damping and stiffness (N, N), given instead of elements."""
+    """Mass, damping and stiffness, given instead of elements.
+
+    Attributes:
+        mass: (N, N), kg or kg m^2.
+        damping: (N, N), N s/m or N m s.
+        stiffness: (N, N), N/m or N m.
+    """
 
     # a shape of its own each: `check_lumped` compares them, and says what is wrong in words
     mass: Float[Array, "N N"]
