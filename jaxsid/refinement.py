@@ -5,6 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues
+from jaxsid.physical.profile import Profile
 
 
 class Validation(eqx.Module):
@@ -62,6 +63,7 @@ class Refinement(eqx.Module):
         before, after: (outputs,) rms(y - yhat) / rms(y) of the nominal and the refined model over all data.
         validation: on data that were held out, None without.
         residuals: of records, None otherwise.
+        profiles: profile likelihoods that were asked for.
         at_bound: names of the values that a bound holds.
         open_combinations: combinations of values of which neither data nor priors tell, in words.
         converged: whether the solver met its tolerance.
@@ -79,6 +81,7 @@ class Refinement(eqx.Module):
     after: Float[Array, " outputs"]
     validation: Validation | None
     residuals: Residuals | None
+    profiles: tuple[Profile, ...]
     at_bound: tuple[str, ...] = eqx.field(static=True)
     open_combinations: tuple[str, ...] = eqx.field(static=True)
     converged: Array

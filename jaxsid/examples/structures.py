@@ -84,7 +84,9 @@ def railway_vehicle() -> LumpedModel:
     return lumped_model(
         names,
         matrices=Matrices(
-            *(jnp.asarray(x) for x in (inertia, _two_storeys(40e3, 16e3), _two_storeys(860e3, 4.88e6)))
+            jnp.asarray(inertia),
+            jnp.asarray(_two_storeys(40e3, 16e3)),
+            jnp.asarray(_two_storeys(860e3, 4.88e6)),
         ),
         inputs=[Input(f"force_{name}", name) for name in names],
         sensors=[Sensor(f"acceleration_{name}", name, "acceleration") for name in names],

@@ -97,7 +97,7 @@ def matrix_form(file: "ModelFile", data: dict[str, Any], path: Path) -> tuple[Se
         key: floating(matrix(rows, len(names), f"{path}: [matrices], key '{key}'"))
         for key, rows in file.matrices.model_dump().items()  # type: ignore[union-attr]
     }
-    return names, {"matrices": Matrices(**matrices)}
+    return names, {"matrices": Matrices(matrices["mass"], matrices["damping"], matrices["stiffness"])}
 
 
 def matrix(rows: list[list[float]], size: int, where: str) -> np.ndarray:

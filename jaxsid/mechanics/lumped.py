@@ -98,12 +98,14 @@ class Matrices(eqx.Module):
         mass: (N, N), kg or kg m^2.
         damping: (N, N), N s/m or N m s.
         stiffness: (N, N), N/m or N m.
+        full: whether every body may be joined with every other; else an entry that is zero is known to be.
     """
 
     # a shape of its own each: `check_lumped` compares them, and says what is wrong in words
     mass: Float[Array, "N N"]
     damping: Float[Array, "P P"]
     stiffness: Float[Array, "Q Q"]
+    full: bool = eqx.field(static=True, default=False)
 
 
 class LumpedModel(eqx.Module):

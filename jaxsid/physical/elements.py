@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, Matrices, incidence, lumped_model
+from jaxsid.mechanics.lumped import (
+    GROUND,
+    Effect,
+    LumpedModel,
+    Matrices,
+    incidence,
+    lumped_model,
+    second_order,
+)
 from jaxsid.physical.parameterization import BLIND, Matrix, Triple
 from jaxsid.records import as_array
 
@@ -111,13 +119,15 @@ def element_matrices(model: LumpedModel, *, effects: bool = False) -> LinearMatr
 
     A spring may damp, also where the model gives it none; a connection without stiffness stays so, since what no
     spring holds is a matter of structure. Matrices are taken apart into masses, and springs and dampers between bodies
-    and to the ground.
+    and to the ground: those that their entries show, or all, if the matrices are full, but to the ground where nothing
+    holds any body there.
 
     Args:
         model: says which there are; its numbers give their sizes.
         effects: whether the parameters of effects, as far as the model gives them, are unknowns too, after the others.
     """
     shapes, names, values = _entries(model) if model.matrices is not None else _elements(model)
+    full = model.matrices is not None and model.matrices.full
     counts = np.cumsum([0, *(len(x) for x in shapes)])
     directions = [
         np.pad(x, ((counts[i], counts[3] - counts[i + 1]), (0, 0), (0, 0))) for i, x in enumerate(shapes)
@@ -127,7 +137,7 @@ def element_matrices(model: LumpedModel, *, effects: bool = False) -> LinearMatr
         (directions[0], directions[1], directions[2]),
         inverse=np.linalg.pinv(whole.T),
         base=np.zeros(counts[3]),
-        mix=np.diag(np.concatenate([np.ones(counts[2]), 1.0 * (values[2] != 0)])),
+        mix=np.diag(np.concatenate([np.ones(counts[2]), 1.0 * ((values[2] != 0) | full)])),
         scale=np.concatenate([_sizes(x) for x in values]),
         nominal=np.concatenate(values),
         listed=tuple(Element(e, q) for q, elements in zip(QUANTITIES, names, strict=True) for e in elements),
@@ -254,7 +264,12 @@ def _entries(model: LumpedModel) -> Parts:
     where the sum of a row is not zero; masses and what couples them."""
     names = [GROUND, *model.bodies]
     mass, damping, stiffness = (np.asarray(getattr(model.matrices, quantity)) for quantity in QUANTITIES)
-    found = [_masses(mass), _joints(damping, stiffness), _joints(stiffness, stiffness)]
+    springs, heavy = _joined(stiffness), mass != 0
+    if model.matrices is not None and model.matrices.full:
+        # where nothing is held to the ground that is a matter of structure too
+        held = np.diag(springs).any()
+        springs, heavy = ~np.diag(np.full(len(mass), not held)), np.ones_like(heavy)
+    found = [_masses(mass, heavy), _joints(damping, springs | _joined(damping)), _joints(stiffness, springs)]
     listed = [[_pair(names[i], names[j]) for i, j, _, _ in one] for one in found]
     shapes = [np.array([x for *_, x in one]).reshape(-1, *[len(model.bodies)] * 2) for one in found]
     return shapes, listed, [np.array([value for _, _, value, _ in one]) for one in found]
@@ -267,24 +282,32 @@ def _pair(one: str, other: str) -> str:
 Couplings = list[tuple[int, int, float, np.ndarray]]
 
 
-def _masses(matrix: np.ndarray) -> Couplings:
-    """Ends (from 1), value and shape of each entry that is not zero."""
-    every, at = np.eye(len(matrix)), np.argwhere(np.triu(matrix))
+def _masses(matrix: np.ndarray, which: np.ndarray) -> Couplings:
+    """Ends (from 1), value and shape of entries, (N, N) of bool."""
+    every, at = np.eye(len(matrix)), np.argwhere(np.triu(which))
     shapes = [np.outer(every[i], every[j]) for i, j in at]
     found = zip(at.tolist(), shapes, strict=True)
     return [(i + 1, j + 1, float(matrix[i, j]), np.maximum(x, x.T)) for (i, j), x in found]
 
 
-def _joints(matrix: np.ndarray, other: np.ndarray) -> Couplings:
-    """Ends (0 the ground), value and shape of each spring or damper that is there in either of two matrices."""
+def _joined(matrix: np.ndarray) -> np.ndarray:
+    """Which bodies a matrix joins, (N, N) of bool, the diagonal for those that it joins to the ground."""
+    return np.where(np.eye(len(matrix), dtype=bool), _to_ground(matrix)[:, None], matrix) != 0
+
+
+def _to_ground(matrix: np.ndarray) -> np.ndarray:
+    """Sums of rows; what rounding leaves is none."""
+    sums = matrix.sum(axis=1)
+    return np.where(np.abs(sums) > ROUNDING * np.abs(matrix).sum(axis=1), sums, 0.0)
+
+
+def _joints(matrix: np.ndarray, which: np.ndarray) -> Couplings:
+    """Ends (0 the ground), value and shape of springs or dampers, as `_joined` names them."""
     found, every = [], np.eye(len(matrix))
-    for i in range(len(matrix)):
-        if any(abs(x[i].sum()) > ROUNDING * np.abs(x[i]).sum() for x in (matrix, other)):
-            found.append((0, i + 1, matrix[i].sum(), np.outer(every[i], every[i])))
-        for j in range(i + 1, len(matrix)):
-            if matrix[i, j] != 0 or other[i, j] != 0:
-                joint = every[i] - every[j]
-                found.append((i + 1, j + 1, -matrix[i, j], np.outer(joint, joint)))
+    for i, j in np.argwhere(np.triu(which)).tolist():
+        joint = every[i] if i == j else every[i] - every[j]
+        value = _to_ground(matrix)[i] if i == j else -matrix[i, j]
+        found.append((0 if i == j else i + 1, j + 1, value, np.outer(joint, joint)))
     return found
 
 
@@ -293,6 +316,24 @@ def _sizes(values: np.ndarray) -> np.ndarray:
     sizes = np.abs(values)
     usual = np.median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
     return np.where(sizes > 0, sizes, usual)
+
+
+def as_full(model: LumpedModel) -> LumpedModel:
+    """The same model as symmetric matrices of which every entry may vary.
+
+    Args:
+        model: elements or matrices.
+    """
+    linear = second_order(model)
+    return lumped_model(
+        model.bodies,
+        matrices=Matrices(linear.mass, linear.damping, linear.stiffness, full=True),
+        inputs=model.inputs,
+        sensors=model.sensors,
+        tolerance=model.tolerance,
+        effects=model.effects,
+        name=model.name,
+    )
 
 
 def with_values(model: LumpedModel, values: Float[Array, " p"]) -> LumpedModel:
@@ -313,8 +354,9 @@ def with_values(model: LumpedModel, values: Float[Array, " p"]) -> LumpedModel:
     values = values[:linear]
     if model.matrices is not None:
         directions = element_matrices(model).directions
-        found = (jnp.einsum("p,pij->ij", values, jnp.asarray(x)) for x in directions)
-        return lumped_model(model.bodies, matrices=Matrices(*found), **places)
+        mass, damping, stiffness = (jnp.einsum("p,pij->ij", values, jnp.asarray(x)) for x in directions)
+        matrices = Matrices(mass, damping, stiffness, full=model.matrices.full)
+        return lumped_model(model.bodies, matrices=matrices, **places)
     bodies, joints = len(model.bodies), len(model.connections)
     mass, damping, stiffness = jnp.split(values, [bodies, bodies + joints])
     return lumped_model(model.bodies, mass, stiffness, damping, connections=model.connections, **places)

@@ -2,14 +2,13 @@
 
 With residual r of unit variance and prior rows the posterior has the mode of least norm(r)^2, and near it the
 precision J'J. The search is Levenberg's and Marquardt's: this library's own, which takes a third of the steps of
-optimistix's here, or any least-squares solver of optimistix; within bounds jaxopt's LBFGSB finds out which ones hold.
+optimistix's here, or any least-squares solver of optimistix.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
@@ -18,14 +17,11 @@ from jaxsid.least_squares import levenberg_marquardt, sums_of
 from jaxsid.physical.elements import LinearMatrices
 from jaxsid.physical.motion import MotionTerm
 from jaxsid.physical.parameterization import Parameterization
-from jaxsid.physical.restrictions import Prior, Restricted
+from jaxsid.physical.restrictions import Prior
 from jaxsid.physical.terms import Term
 
 STEPS = 100
-SEARCHES = 80  # of the bounded quasi-Newton method, which only finds out which bounds hold
 GAIN = 1e-8  # part of the sum of squares that a last step may still bring
-ROUNDS = 8  # of changing which bounds hold
-NEAR = 1e-7  # of an unknown's scale: closer to a bound it lies on it
 Data = Term | MotionTerm
 Solver = optimistix.AbstractLeastSquaresSolver
 
@@ -52,7 +48,7 @@ class Posterior(NamedTuple):
     converged: Bool[Array, ""]
 
 
-class _Sums(NamedTuple):
+class Sums(NamedTuple):
     """r'r, J'J, J'r of the data."""
 
     squares: Array
@@ -60,7 +56,14 @@ class _Sums(NamedTuple):
     gradient: Array
 
 
-def _sums(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> _Sums:
+def sums(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> Sums:
+    """Of the weighted residual.
+
+    Args:
+        terms: the data.
+        parameterization: what the unknowns mean.
+        theta: (p,) unknowns.
+    """
     parts = []
     if any(isinstance(term, Term) for term in terms):
         matrices = parameterization.matrices(theta)
@@ -72,12 +75,19 @@ def _sums(terms: tuple[Data, ...], parameterization: Parameterization, theta: Ar
             r, j = term.projected(parameterization, theta)
             parts.append(sums_of(r.ravel(), j.reshape(-1, len(theta))))
     cost, product, gradient = (jnp.stack(x).sum(axis=0) for x in zip(*parts, strict=True))
-    return _Sums(2 * cost, product, gradient)
+    return Sums(2 * cost, product, gradient)
 
 
-def _with_prior(sums: _Sums, prior: Prior, theta: Array) -> tuple[Array, Array, Array]:
+def with_prior(found: Sums, prior: Prior, theta: Array) -> tuple[Array, Array, Array]:
+    """Sum of squares, J'J and J'r of data and prior.
+
+    Args:
+        found: those of the data.
+        prior: of the unknowns.
+        theta: (p,) unknowns.
+    """
     r, j = prior.rows(theta)
-    return sums.squares + r @ r, sums.product + j.T @ j, sums.gradient + j.T @ r
+    return found.squares + r @ r, found.product + j.T @ j, found.gradient + j.T @ r
 
 
 @compiled
@@ -101,7 +111,7 @@ def most_probable(
         return _by_optimistix(terms, parameterization, prior, start, solver)
 
     def evaluate(theta: Array) -> tuple[Array, Array, Array]:
-        squares, product, gradient = _with_prior(_sums(terms, parameterization, theta), prior, theta)
+        squares, product, gradient = with_prior(sums(terms, parameterization, theta), prior, theta)
         return 0.5 * squares, product, gradient
 
     found = levenberg_marquardt(evaluate, start, max_steps=STEPS, tolerance=GAIN)
@@ -109,7 +119,7 @@ def most_probable(
     return Posterior(
         found.value,
         2 * found.cost - r @ r,
-        _count(terms),
+        count(terms),
         found.jacobian_product - j.T @ j,
         found.seen_gradient,
         found.steps,
@@ -117,7 +127,12 @@ def most_probable(
     )
 
 
-def _count(terms: tuple[Data, ...]) -> Array:
+def count(terms: tuple[Data, ...]) -> Array:
+    """Number of equations.
+
+    Args:
+        terms: the data.
+    """
     return jnp.asarray(sum(term.equations for term in terms))
 
 
@@ -127,7 +142,7 @@ def _by_optimistix(
     """The same by a solver of optimistix, to which all equations are p + 1 with the same squares and slopes."""
 
     def both(theta: Array) -> tuple[Array, Array]:
-        return _factored(*_with_prior(_sums(terms, parameterization, theta), prior, theta))
+        return _factored(*with_prior(sums(terms, parameterization, theta), prior, theta))
 
     @jax.custom_jvp
     def residual(theta: Array) -> Array:
@@ -141,10 +156,30 @@ def _by_optimistix(
     found = optimistix.least_squares(
         lambda theta, _: residual(theta), solver, start, max_steps=STEPS, throw=False
     )
-    sums = _sums(terms, parameterization, found.value)
-    _, _, gradient = _with_prior(sums, prior, found.value)
     steps, converged = jnp.asarray(found.stats["num_steps"]), found.result == optimistix.RESULTS.successful
-    return Posterior(found.value, sums.squares, _count(terms), sums.product, gradient, steps, converged)
+    return posterior_at(terms, parameterization, prior, found.value, steps, converged)
+
+
+def posterior_at(
+    terms: tuple[Data, ...],
+    parameterization: Parameterization,
+    prior: Prior,
+    theta: Array,
+    steps: Array,
+    converged: Array,
+) -> Posterior:
+    """What is known near unknowns that a search has come to.
+
+    Args:
+        terms: the data.
+        parameterization: what the unknowns mean.
+        prior: of the unknowns.
+        theta: (p,) unknowns.
+        steps, converged: of the search.
+    """
+    found = sums(terms, parameterization, theta)
+    _, _, gradient = with_prior(found, prior, theta)
+    return Posterior(theta, found.squares, count(terms), found.product, gradient, steps, converged)
 
 
 def _factored(squares: Array, product: Array, gradient: Array) -> tuple[Array, Array]:
@@ -165,6 +200,28 @@ def _factored(squares: Array, product: Array, gradient: Array) -> tuple[Array, A
 
 
 @compiled
+def from_each(
+    terms: tuple[Data, ...],
+    parameterization: Parameterization,
+    prior: Prior,
+    starts: Float[Array, "starts p"],
+    solver: Solver | None = None,
+) -> Posterior:
+    """`most_probable` from several starts: together, or one by one where each is a long simulation.
+
+    Args:
+        terms: the data.
+        parameterization: what may vary.
+        prior: of the unknowns.
+        starts: unknowns to begin with.
+        solver: of optimistix; None for `levenberg_marquardt`.
+    """
+    one = lambda start: most_probable(terms, parameterization, prior, start, solver)  # noqa: E731
+    together = all(isinstance(term, Term) for term in terms)
+    return jax.vmap(one)(starts) if together else jax.lax.map(one, starts)
+
+
+@compiled
 def squares_at(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> Array:
     """Sum of the squares of the data's weighted residual.
 
@@ -173,102 +230,7 @@ def squares_at(terms: tuple[Data, ...], parameterization: Parameterization, thet
         parameterization: what the unknowns mean.
         theta: unknowns.
     """
-    return _sums(terms, parameterization, theta).squares
-
-
-@compiled
-def _bounded(
-    terms: tuple[Data, ...],
-    parameterization: Parameterization,
-    prior: Prior,
-    start: Array,
-    lower: Array,
-    upper: Array,
-) -> Array:
-    """The mode within bounds, nearly: the limited-memory quasi-Newton method of R. Byrd et al. (1995), jaxopt."""
-    import jaxopt
-
-    count = jnp.maximum(_count(terms), 1)
-
-    def cost(theta: Array) -> tuple[Array, Array]:
-        squares, _, gradient = _with_prior(_sums(terms, parameterization, theta), prior, theta)
-        return 0.5 * squares / count, gradient / count
-
-    solver = jaxopt.LBFGSB(cost, value_and_grad=True, maxiter=SEARCHES, tol=1e-9)
-    return solver.run(start, bounds=(lower, upper)).params
-
-
-class BoundedFit(NamedTuple):
-    """A mode within bounds.
-
-    Attributes:
-        posterior: over all unknowns; those at bounds have no information.
-        unknowns: with those at bounds held.
-        at_bound: (p,) which these are.
-    """
-
-    posterior: Posterior
-    unknowns: LinearMatrices
-    at_bound: Bool[np.ndarray, " p"]
-
-
-def within_bounds(
-    terms: tuple[Data, ...], known: Restricted, start: Array, solver: Solver | None = None
-) -> BoundedFit:
-    """The mode of the posterior within the bounds, exact for those that hold: an active-set method.
-
-    Where the free mode lies outside, what it exceeds is held at the bounds and the rest fitted anew; bounds that are
-    met on the way are added, those from which the posterior pulls inwards released. Where that does not come to an
-    end a bounded search says which hold.
-
-    Args:
-        terms: the data.
-        known: unknowns, bounds, priors.
-        start: (p,) unknowns to begin with.
-        solver: as of `most_probable`.
-    """
-    free, scale = known.unknowns, np.asarray(known.unknowns.scale)
-    lower, upper = known.lower / scale, known.upper / scale
-    begin = jnp.asarray(np.clip(np.asarray(start), lower, upper))
-    found = most_probable(terms, free, known.prior, begin, solver)
-    at = np.asarray(found.theta)
-    outside = (at < lower) | (at > upper)
-    if not np.isfinite(at).all() or not outside.any():
-        return BoundedFit(found, free, np.zeros(len(at), bool))
-    fit, settled = _with_active_bounds(terms, known, at, outside, solver)
-    if settled:
-        return fit
-    at = np.clip(at, lower, upper)
-    at = np.asarray(_bounded(terms, free, known.prior, *(jnp.asarray(x) for x in (at, lower, upper))))
-    near = (at - lower < NEAR) | (upper - at < NEAR)
-    searched, settled = _with_active_bounds(terms, known, at, near, solver)
-    return searched if settled or searched.posterior.squares < fit.posterior.squares else fit
-
-
-def _with_active_bounds(
-    terms: tuple[Data, ...], known: Restricted, start: np.ndarray, held: np.ndarray, solver: Solver | None
-) -> tuple[BoundedFit, bool]:
-    """The mode with some unknowns at their bounds, these changed until all pull outwards; whether they were."""
-    free, scale = known.unknowns, np.asarray(known.unknowns.scale)
-    lower, upper, at = known.lower / scale, known.upper / scale, start
-    for _ in range(ROUNDS):
-        at = np.clip(at, lower, upper)
-        unknowns = free.held(held, at * scale)
-        weight = np.where(held, 0.0, np.asarray(known.prior.weight))
-        found = most_probable(terms, unknowns, Prior(known.prior.mean, weight), jnp.asarray(at), solver)
-        at = np.where(held, at, np.asarray(found.theta))
-        fit = BoundedFit(found._replace(theta=jnp.asarray(at)), unknowns, held)
-        outside = (at < lower) | (at > upper)
-        if outside.any():
-            held = held | outside
-            continue
-        pull = np.asarray(gradient_at(terms, free, known.prior, jnp.asarray(at)))
-        released = held & np.where(at - lower < upper - at, pull < 0, pull > 0)
-        if not released.any():
-            return fit, True
-        held = held & ~released
-    last = found._replace(theta=jnp.asarray(np.clip(at, lower, upper)), converged=jnp.asarray(False))
-    return BoundedFit(last, unknowns, held), False
+    return sums(terms, parameterization, theta).squares
 
 
 @compiled
@@ -283,4 +245,4 @@ def gradient_at(
         prior: of the unknowns.
         theta: unknowns.
     """
-    return _with_prior(_sums(terms, parameterization, theta), prior, theta)[2]
+    return with_prior(sums(terms, parameterization, theta), prior, theta)[2]

@@ -14,9 +14,11 @@ from jaxsid.checks import bad_input, require
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import Element, LinearMatrices, element_matrices
+from jaxsid.physical.interior import Cone, positive_cone
 from jaxsid.physical.parameterization import Matrix
 
 SMALLEST = 1e-9  # of a mass that the model has: it must stay positive
+SCATTER = 0.3  # of the model's numbers: how far random starts lie from them
 Pair = tuple[float, float]
 
 
@@ -45,6 +47,7 @@ class Restricted(NamedTuple):
         names: of each unknown.
         lower, upper: (p,) bounds, SI units.
         prior: of each unknown.
+        cone: where mass, damping and stiffness are positive, if that is more than bounds.
     """
 
     unknowns: LinearMatrices
@@ -52,6 +55,7 @@ class Restricted(NamedTuple):
     lower: Float[np.ndarray, " p"]
     upper: Float[np.ndarray, " p"]
     prior: Prior
+    cone: Cone | None = None
 
 
 def restricted(
@@ -98,7 +102,43 @@ def restricted(
         (np.where(still, np.asarray(every.nominal), 0.0), mix, scale),
     )
     labels = tuple(" = ".join(names[i] for i in group) for group in groups)
-    return Restricted(unknowns, labels, lower, upper, Prior(mean / scale, weight * scale))
+    # elements are positive each, so that their matrices are; entries may have either sign
+    cone = positive_cone(unknowns) if model.matrices is not None else None
+    return Restricted(unknowns, labels, lower, upper, Prior(mean / scale, weight * scale), cone)
+
+
+def unknown_number(known: Restricted, text: str, where: str) -> int:
+    """Which unknown a value follows.
+
+    Args:
+        known: the unknowns.
+        text: name of the value.
+        where: for the message.
+
+    Raises:
+        InputError: no such value, several, or one that is fixed.
+    """
+    names = [x.name for x in known.unknowns.listed]
+    found = _matching(text, names, where)
+    require(len(found) == 1, f"{where}: '{text}' stands for several values; name one.")
+    columns = np.flatnonzero(np.asarray(known.unknowns.mix)[found[0]])
+    require(columns.size == 1, f"{where}: '{text}' is fixed, or a connection without stiffness.")
+    return int(columns[0])
+
+
+def scattered(known: Restricted, count: int, seed: int) -> Float[np.ndarray, "count p"]:
+    """Unknowns drawn evenly from within 30 % of the model's, and within their bounds.
+
+    Args:
+        known: the unknowns.
+        count: how many sets.
+        seed: of the random numbers.
+    """
+    scale = np.asarray(known.unknowns.scale)
+    nominal = np.asarray(known.unknowns.of_values(jnp.asarray(known.unknowns.nominal)))
+    size = np.where(nominal == 0, 1.0, np.abs(nominal))
+    drawn = nominal + SCATTER * size * np.random.default_rng(seed).uniform(-1, 1, (count, len(nominal)))
+    return np.clip(drawn, known.lower / scale, known.upper / scale)
 
 
 def _matching(text: str, names: list[str], where: str) -> np.ndarray:

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from jaxsid.compilation import compiled
 from jaxsid.impulse.whitening import whitening_filter
 from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.bounded import BoundedFit
 from jaxsid.physical.elements import LinearMatrices, element_matrices, with_values
 from jaxsid.physical.motion import Left, MotionTerm, counted
-from jaxsid.physical.posterior import BoundedFit
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.motion_terms import Windows, lowest_frequency, motion_term, window_length
@@ -41,7 +41,7 @@ def refine_motion(
     how.say("values of the model and its effects")
     early = tuple(_held_out(term, late=False) for term in terms) if how.validate else None
     nuisances = sum(len(term.free) * len(term.state) for term in terms)
-    problem = Problem(known, terms, early, (theta,), nuisances, solver=how.solver)
+    problem = Problem(known, terms, early, (theta,), nuisances, solver=how.solver, profiled=how.profiled)
     fit, before = solved(problem)
     how.say("validation")
 
@@ -89,6 +89,7 @@ def _settled(
         parts = tuple(motion_term(model, records, cut, rest=False) for cut in short)
         for _ in range(STATE_ROUNDS):
             theta = _fitted(known, parts, theta, how)
+            how = how._replace(scattered=None)
             parts = tuple(_from_best_states(part, known.unknowns, theta) for part in parts)
         theta = _fitted(known, parts, theta, how)
         begun = tuple(_begun(part, known.unknowns, theta) for part in parts)
@@ -99,6 +100,7 @@ def _settled(
         for _ in range(ROUNDS):
             how.say("level and colour of the noise")
             theta = _fitted(known, terms, theta, how)
+            how = how._replace(scattered=None)  # further starts are for the first fit
             terms = _weighed(terms, cuts, known.unknowns, theta)
         # where the windows follow from the model, those of the fitted one count
         better = window_length(with_values(model, known.unknowns.values(theta)), records, window)
@@ -135,7 +137,8 @@ def _from_states(term: MotionTerm, states: Array) -> MotionTerm:
 
 
 def _fitted(known: Restricted, terms: Terms, start: Array, how: Manner) -> Array:
-    fit, _ = solved(Problem(known, terms, None, (start,), weighed=False, solver=how.solver))
+    problem = Problem(known, terms, None, (start,), weighed=False, solver=how.solver)
+    fit, _ = solved(problem._replace(scattered=how.scattered))
     return fit.posterior.theta
 
 

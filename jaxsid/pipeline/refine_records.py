@@ -53,7 +53,16 @@ def refine_records(
         train = (LineTerm(_target(space, first, _noise_on(first, space)), sensed),)
     say("mass, damping and stiffness")
     nuisances = len(records) * (2 * len(model.bodies) + 1) * len(system.outputs)
-    problem = Problem(known, (every,), train, (near, nominal_unknowns(known)), nuisances, solver=how.solver)
+    problem = Problem(
+        known,
+        (every,),
+        train,
+        (near, nominal_unknowns(known)),
+        nuisances,
+        solver=how.solver,
+        profiled=how.profiled,
+        scattered=how.scattered,
+    )
     fit, before = solved(problem)
     say("validation")
 

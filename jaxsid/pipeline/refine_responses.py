@@ -10,10 +10,11 @@ from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import continuous, discretise
 from jaxsid.mechanics.lumped import LumpedModel, free_bodies, loose_bodies, second_order
 from jaxsid.mechanics.simulate import markov_parameters
+from jaxsid.physical.bounded import BoundedFit
 from jaxsid.physical.cbsi import visible_states
 from jaxsid.physical.elements import ElementValues, with_values
 from jaxsid.physical.measured import every_other, frequency_term, response_term, response_weights
-from jaxsid.physical.posterior import BoundedFit, Solver, most_probable
+from jaxsid.physical.posterior import Solver, most_probable
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.physical.terms import ResponseTerm
 from jaxsid.physical.widened import widened_start
@@ -68,6 +69,7 @@ def refine_traced(
         after=nothing,
         validation=None,
         residuals=None,
+        profiles=(),
         at_bound=(),
         open_combinations=(),
         converged=found.converged,
@@ -90,13 +92,22 @@ def refine_response(
     weights = response_weights(ir, noise)
     if noise is None:
         how.say("the level of the noise")
-        rough, _ = solved(Problem(known, train(weights), None, starts, weighed=False, solver=how.solver))
+        first = Problem(known, train(weights), None, starts, weighed=False, solver=how.solver)
+        rough, _ = solved(first._replace(scattered=how.scattered))
         starts = (rough.posterior.theta,)
         left = ir.h - _response_of(fitted_model(model, rough), ir)
         weights = response_weights(ir, None, left)
     how.say("mass, damping and stiffness")
     every = (response_term(ir, sensed, weights),)
-    problem = Problem(known, every, train(weights) if how.validate else None, starts, solver=how.solver)
+    problem = Problem(
+        known,
+        every,
+        train(weights) if how.validate else None,
+        starts,
+        solver=how.solver,
+        profiled=how.profiled,
+        scattered=None if noise is None else how.scattered,
+    )
     fit, before = solved(problem)
     outputs = tuple(s.name for s in model.sensors)
 
@@ -166,7 +177,15 @@ def refine_frequencies(
     every = frequency_term(response, sensed, interval, hold)
     train = (frequency_term(response, sensed, interval, hold, used),) if how.validate else None
     how.say("mass, damping and stiffness")
-    problem = Problem(known, (every,), train, (nominal_unknowns(known),), solver=how.solver)
+    problem = Problem(
+        known,
+        (every,),
+        train,
+        (nominal_unknowns(known),),
+        solver=how.solver,
+        profiled=how.profiled,
+        scattered=how.scattered,
+    )
     fit, before = solved(problem)
     H = np.asarray(response.H)
 

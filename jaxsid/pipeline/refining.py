@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxsid.checks import bad_input, require
 from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.bounded import BoundedFit, within_bounds
 from jaxsid.physical.elements import (
     ElementValues,
     LinearMatrices,
@@ -18,12 +19,14 @@ from jaxsid.physical.elements import (
     with_values,
 )
 from jaxsid.physical.parameterization import BLIND
-from jaxsid.physical.posterior import BoundedFit, Data, Solver, squares_at, within_bounds
+from jaxsid.physical.posterior import Data, Solver, from_each, squares_at
+from jaxsid.physical.profile import Profile, profile
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.matrices import GOOD, POOR
 from jaxsid.records import as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
+BETTER = -1.0  # rise of a profile that shows a better optimum
 FAINT = 0.01  # part of a combination, next to its largest, that is not named
 Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
 Spread = Callable[[BoundedFit], np.ndarray]  # covariance of J'r, where it is not J'J
@@ -36,11 +39,15 @@ class Manner(NamedTuple):
         validate: whether a part of the data is kept from a first fit.
         say: called with a line of text as each stage begins.
         solver: of optimistix; None for this library's own.
+        profiled: numbers of the unknowns whose profile likelihood is asked for.
+        scattered: (starts, p) further unknowns to begin with, None for none.
     """
 
     validate: bool
     say: Callable[[str], None]
-    solver: Solver | None
+    solver: Solver | None = None
+    profiled: tuple[int, ...] = ()
+    scattered: Array | None = None
 
 
 class Problem(NamedTuple):
@@ -53,7 +60,7 @@ class Problem(NamedTuple):
         starts: unknowns to begin with, the most promising first.
         nuisances: number of unknowns, such as those of transients, that the terms project out.
         weighed: whether the level of the noise is known, so that a fit can be told to be good.
-        solver: as in `Manner`.
+        solver, profiled, scattered: as in `Manner`.
     """
 
     known: Restricted
@@ -63,14 +70,20 @@ class Problem(NamedTuple):
     nuisances: int = 0
     weighed: bool = True
     solver: Solver | None = None
+    profiled: tuple[int, ...] = ()
+    scattered: Array | None = None
 
 
 def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     """Fits to all and to a part of the data, from the start that leads to the least misfit."""
     known, first = problem.known, problem.train or problem.every
-    best, least = None, np.inf
-    for start in problem.starts:
-        if len(problem.starts) > 1 and not np.isfinite(float(squares_at(first, known.unknowns, start))):
+    best, least, starts = None, np.inf, problem.starts
+    if problem.scattered is not None:
+        every = from_each(first, known.unknowns, known.prior, problem.scattered, problem.solver)
+        squares = np.where(np.isfinite(every.squares), every.squares, np.inf)
+        starts = (every.theta[int(squares.argmin())], *starts)
+    for start in starts:
+        if len(starts) > 1 and not np.isfinite(float(squares_at(first, known.unknowns, start))):
             continue
         fit = within_bounds(first, known, start, problem.solver)
         squares = float(fit.posterior.squares)
@@ -172,6 +185,11 @@ def concluded(
     share = np.where(mix.any(axis=1), certain.share[owner], np.nan)
     refined = with_values(model, values.values)
     held = tuple(n for n, at in zip(problem.known.names, fit.at_bound, strict=True) if at)
+    held += tuple(f"{matrix} (positive only just)" for matrix in fit.singular)
+    profiles = tuple(
+        profile(problem.every, problem.known, fit, certain.covariance, certain.misfit, which)
+        for which in problem.profiled
+    )
     combinations = _open(unknowns, certain.information, problem.known.names)
     return Refinement(
         nominal=model,
@@ -185,11 +203,13 @@ def concluded(
         after=as_array(errors(refined)),
         validation=validation,
         residuals=None if residuals is None else residuals(refined),
+        profiles=profiles,
         at_bound=held,
         open_combinations=combinations,
         converged=fit.posterior.converged,
-        warnings=_warnings(
-            certain.misfit, values, held, combinations, validation, bool(fit.posterior.converged)
+        warnings=(
+            *_warnings(certain.misfit, values, held, combinations, validation, bool(fit.posterior.converged)),
+            *_about_profiles(profiles),
         ),
     )
 
@@ -226,12 +246,23 @@ def _warnings(
         )
     vague = [
         x.name
-        for x, value, std in zip(values.listed, values.values, values.deviation, strict=True)
-        if np.isfinite(std) and float(std) > abs(float(value)) > 0
+        for x, value, std, nominal in zip(
+            values.listed, values.values, values.deviation, values.nominal, strict=True
+        )
+        if nominal != 0 and np.isfinite(std) and float(std) > abs(float(value)) > 0
     ]
     if vague:
         said.append(f"Hardly determined, with a standard deviation above the value: {', '.join(vague)}.")
     return tuple(said)
+
+
+def _about_profiles(profiles: tuple[Profile, ...]) -> tuple[str, ...]:
+    return tuple(
+        f"With {p.name} at {float(p.values[p.rise.argmin()]):.5g} the others fit better than in the refined model: its "
+        "fit ended in a lesser optimum. Start from a model with that value, or ask for more `starts`."
+        for p in profiles
+        if float(p.rise.min()) < BETTER
+    )
 
 
 def nominal_unknowns(known: Restricted) -> Array:
