@@ -34,7 +34,7 @@ SWEEPS = {"1 DOF": (ONE, (0.02, 3, 100)), "3 DOF": (CHAIN, (0.1, 10, 10))}
 
 
 @pytest.mark.parametrize("method", [Direct(), Wavelet("db4")], ids=["direct", "wavelet"])
-@pytest.mark.parametrize("system", SWEEPS)
+@pytest.mark.parametrize("system", ["1 DOF", pytest.param("3 DOF", marks=pytest.mark.slow)])
 def test_sweep_gives_poles_and_matrices(system, method):
     """The sweep starts at 0, so that the Toeplitz matrix is singular: the shift by one sample mends that."""
     matrices, sweep = SWEEPS[system]
@@ -64,7 +64,7 @@ def white(seed=0, samples=1024, dt=0.02, level=0.01, inputs=3):
     return noisy(Record(u[:, :inputs], respond(CHAIN, dt, u), dt), level, rng)
 
 
-@pytest.mark.parametrize("dt", [1e-3, 0.02])
+@pytest.mark.parametrize("dt", [pytest.param(1e-3, marks=pytest.mark.slow), 0.02])
 def test_white_excitation_with_noise(dt):
     record = white(samples=4096, inputs=1, dt=dt)
     ir = Direct()([record])

@@ -47,6 +47,7 @@ def test_the_feedthrough_is_not_lost_in_a_coarse_subspace():
     assert error(h[1:], truth[1:]) < 0.03
 
 
+@pytest.mark.slow
 def test_a_coarse_subspace_regularizes():
     """What the basis buys: with 1 % noise on a sweep the plain solution is useless, the coarse one is not."""
     rng = np.random.default_rng(0)

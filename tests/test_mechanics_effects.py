@@ -231,10 +231,12 @@ def values_of(model, u, **parameters):
     [
         ("coulomb_friction", WALL, {"force": 3.0}),
         ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.3}),
-        ("backlash", JOINT, {"half_gap": 0.002}),
+        pytest.param("backlash", JOINT, {"half_gap": 0.002}, marks=pytest.mark.slow),
         ("input_delay", 0, {"delay": 0.0034}),
-        ("sensor_lag", 0, {"time_constant": 0.004}),
-        ("missing_mode", 1, {"mass": 0.2, "stiffness": 300.0, "damping": 0.5}),
+        pytest.param("sensor_lag", 0, {"time_constant": 0.004}, marks=pytest.mark.slow),
+        pytest.param(
+            "missing_mode", 1, {"mass": 0.2, "stiffness": 300.0, "damping": 0.5}, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_derivatives(kind, place, parameters):

@@ -130,7 +130,7 @@ def run(row, seed, **options):
 
 
 # Every row in `test_accuracy_over_many_records`, which is slow: each new size of a system compiles for long.
-@pytest.mark.parametrize("name", ["one force", "three forces", "drive", "mixed", "free"])
+@pytest.mark.parametrize("name", ["one force", "three forces", "mixed", "free"])
 def test_accuracy_from_one_noisy_record(name):
     row = ROWS[name]
     found = run(row, 1)
@@ -218,6 +218,7 @@ def test_two_sampling_rates_of_one_system(model):
     assert unexpected(found) == []
 
 
+@pytest.mark.slow
 def test_two_sampling_rates_without_noise_are_exactly_one_system(model):
     records = [recorded(model, *experiment(SYSTEM, 6, noise=0.0, dt=dt), dt) for dt in (1e-3, 2e-3)]
     check(identify(model, records), SYSTEM, Limits(1e-8, 1e-7, 1e-7, 1e-6))
@@ -286,7 +287,11 @@ def test_data_correlations(model, noisy):
     check(found, SYSTEM, USUAL)
 
 
-@pytest.mark.parametrize("method", [Wavelet(), Direct(), Fourier()], ids=["wavelet", "direct", "fourier"])
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(Wavelet(), marks=pytest.mark.slow), Direct(), Fourier()],
+    ids=["wavelet", "direct", "fourier"],
+)
 def test_other_estimators_on_a_full_band_record(model, method):
     rng = np.random.default_rng(13)
     u = rng.standard_normal((8000, 1))

@@ -193,7 +193,9 @@ def chirps(name):
 @pytest.mark.parametrize(
     "method", [jaxsid.Wavelet("db4", level=12), jaxsid.Direct()], ids=["wavelet", "direct"]
 )
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", ["1 DOF", "3 DOF, three inputs", pytest.param("3 DOF, one input", marks=pytest.mark.slow)]
+)
 def test_from_the_chirps(name, method):
     """The last sample is not determined by a force that starts at zero; no window here reaches it."""
     case = CASES[name]
@@ -252,7 +254,7 @@ def test_a_noise_free_tone_gives_the_poles(name):
     ("name", "level", "least"),
     [
         ("1 DOF", 1e-2, 0.01),
-        ("3 DOF", 1e-2, 0.2),
+        pytest.param("3 DOF", 1e-2, 0.2, marks=pytest.mark.slow),
         ("rig", 1e-2, 0.2),
         pytest.param("3 DOF", 1e-6, 0.01, marks=pytest.mark.slow),
         pytest.param("rig", 1e-6, 0.2, marks=pytest.mark.slow),

@@ -99,6 +99,7 @@ def test_refuses():
         ensemble(lambda key: jnp.zeros(()), KEY, 0)
 
 
+@pytest.mark.slow
 def test_several_devices_give_the_same_bits(tmp_path: Path):
     script = """
 import sys, jax
