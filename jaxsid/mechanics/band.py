@@ -6,6 +6,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsid.mechanics.functions_of_matrices import phi_functions
+from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.mechanics.recursion import run
 from jaxsid.records import ContinuousModel
 
@@ -39,7 +40,7 @@ def _harmonics(model: ContinuousModel, frequencies: Array, spectrum: Array) -> t
     def respond(pair: tuple[Array, Array]) -> tuple[Array, Array]:
         w, U = pair
         forces = (U @ model.B.T)[:, :, None]
-        x = jnp.linalg.solve(1j * w[:, None, None] * eye - model.A, forces)[:, :, 0]
+        x = (inverse_each(1j * w[:, None, None] * eye - model.A) @ forces)[:, :, 0]
         return x, x @ model.C.T + U @ model.D.T
 
     states, outputs = lax.map(respond, (w, U))

@@ -22,6 +22,7 @@ from jaxsid.compilation import compiled
 from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
 from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
+from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.physical.parameterization import BLIND, Parameterization, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
@@ -227,7 +228,7 @@ def _lines_and_slopes(target: Target, matrices: Triple, sensed: SecondOrderModel
     """Modelled lines (lines, outputs) and their derivatives (lines, entries, outputs) to the upper triangles."""
     s = target.s[:, None, None]
     M, D, K = matrices
-    inverse = jnp.linalg.inv(M * s**2 + D * s + K)
+    inverse = inverse_each(M * s**2 + D * s + K)
     x = jnp.einsum("kab,kb->ka", inverse, target.drive @ sensed.input_matrix.T)
     seen = sensed.displacement_sensors + s * sensed.velocity_sensors + s**2 * sensed.acceleration_sensors
     p = jnp.swapaxes(seen @ inverse, 1, 2)
@@ -271,7 +272,7 @@ def _without_transients(
         sensed: gives the sensors.
     """
     F = jnp.einsum("kr,rnm->knm", target.record, F)
-    inverse = jnp.linalg.inv(target.x[:, None, None] * jnp.eye(F.shape[1]) - F)
+    inverse = inverse_each(target.x[:, None, None] * jnp.eye(F.shape[1]) - F)
     pushes = dF.reshape(len(dF), -1, dF.shape[-1])
     places = sensed.displacement_sensors + sensed.velocity_sensors + sensed.acceleration_sensors
     constant = target.record.astype(inverse.dtype)

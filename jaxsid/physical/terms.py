@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
+from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.physical.inband_fit import Target, line_residual
 from jaxsid.physical.parameterization import Triple
 from jaxsid.records import SecondOrderModel
@@ -143,7 +144,7 @@ class FrequencyTerm(eqx.Module):
         else:
             A, B, C, D = sampled_with_slopes(matrices, slopes, self.sensed, self.dt, self.ramps)
             points = jnp.exp(self.s * self.dt)
-        inverse = jnp.linalg.inv(points[:, None, None] * jnp.eye(A.shape[1]) - A[0])
+        inverse = inverse_each(points[:, None, None] * jnp.eye(A.shape[1]) - A[0])
         x, p = inverse @ B[0], C[0] @ inverse
         change = jnp.einsum("kon,dnm,kmi->dkoi", p, A[1:], x) + jnp.einsum("don,kni->dkoi", C[1:], x)
         change = change + jnp.einsum("kon,dni->dkoi", p, B[1:]) + D[1:, None]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsid.compilation import compiled
+from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.physical.inband_fit import Target, fit_matrices
 from jaxsid.physical.parameterization import Parameterization, Triple
 from jaxsid.records import ContinuousModel, SecondOrderModel
@@ -44,7 +45,7 @@ def widened_start(
 @compiled
 def _responses(A: Array, B: Array, C: Array, D: Array, s: Array) -> Target:
     """The model's response to each input in turn at points s, as lines without transients."""
-    inner = jnp.linalg.solve(s[:, None, None] * jnp.eye(len(A)) - A, B.astype(s.dtype))
+    inner = inverse_each(s[:, None, None] * jnp.eye(len(A)) - A) @ B
     outputs, points, inputs = len(C), len(s), B.shape[1]
     y = jnp.moveaxis(C @ inner + D, 2, 0).reshape(inputs * points, outputs)
     drive = jnp.repeat(jnp.eye(inputs, dtype=s.dtype), points, axis=0)
