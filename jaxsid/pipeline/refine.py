@@ -136,7 +136,7 @@ def refine(
 
 def _further(known: Restricted, count: int, seed: int, near: LumpedModel | None) -> Array | None:
     """Unknowns to begin with beside the usual ones: random ones and those of a model."""
-    rows = list(scattered(known, count, seed))
+    rows = list(scattered(known, count, seed)) if count else []
     if near is not None:
         linear = second_order(near)
         rows.append(np.asarray(known.unknowns.unknowns((linear.mass, linear.damping, linear.stiffness))))
