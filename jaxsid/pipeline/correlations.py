@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.records import as_array
-from jaxsid.refinement import Residuals
+from jaxsid.records import Residuals, as_array
 
 LAGS = 200  # of the correlations of what is left, at most
 ONE_PERCENT = 2.576  # standard deviations that chance exceeds once in a hundred times, either side
