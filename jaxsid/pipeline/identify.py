@@ -155,10 +155,7 @@ def _collect(
         ),
         warnings=(
             *_about_records(records, lines),
-            *space.warnings,
-            *_left_out(model),
-            *found.warnings,
-            *_missing(model, system),
+            *(*space.warnings, *_left_out(model), *found.warnings, *_missing(model, system)),
             *_inputs_left(residuals, records, system, times),
         ),
     )

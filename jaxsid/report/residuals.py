@@ -54,8 +54,8 @@ def _picture(found: Identification, left: list[Left]) -> Picture:
 
 CAPTION = (
     "Top: what is left against itself, so much later. Bottom: against the input that it follows most. Dashed: what "
-    "chance exceeds at one lag in a hundred, of white noise (top) and of noise of this colour that has nothing to do with "
-    "the input (bottom)."
+    "chance exceeds at one lag in a hundred, of white noise (top) and of noise of this colour that has nothing to do "
+    "with the input (bottom)."
 )
 MEANING = (
     "The residual is what was measured less what the model predicts. It should have nothing to do with the inputs: "
@@ -94,14 +94,12 @@ def _verdict(found: Identification, left: list[Left]) -> Notice:
     telling = [x for x in following if float(found.train_nrmse[x.output]) > NEGLIGIBLE]
     coloured = [x for x in left if x.own[3] > 1]
     if not following:
-        first = (
-            "What is left is independent of the inputs: nothing that these drive is missing from the model."
-        )
+        first = "What is left is independent of the inputs, as far as correlation tells: no sign of anything missing."
     elif not telling:
         first = f"What is left follows the inputs, but is less than {percent(NEGLIGIBLE)} of any sensor: rounding."
     else:
         first = f"What is left of {names(telling)} follows the inputs: the model misses something that they drive."
-    second = "It is white: noise of the sensors alone explains it."
+    second = "It is white, as the noise of sensors mostly is."
     if coloured:
         second = f"It is not white at {names(coloured)}: coloured noise"
         second += ", or motion that the model does not have." if telling else "."
