@@ -150,7 +150,7 @@ def test_without_refinement_it_says_so(found):
 def following(found):
     """The same with a trace of the force, five samples late, in the second sensor, and colour in the third."""
     (record,) = found.records
-    e = np.asarray(record.y - found.predictions[0])
+    e = np.array(record.y - found.predictions[0])
     u = np.asarray(record.u)[:, 0]
     e[:, 1] += 0.5 * e[:, 1].std() / u.std() * np.roll(u, 5)
     e[:, 2] = np.convolve(e[:, 2], [1, 1, 1, 1], "same")

@@ -40,6 +40,6 @@ def correlations(
         autocorrelation=as_array(own[: lags + 1] * absent),
         white_limit=float(ONE_PERCENT / np.sqrt(samples)),
         cross_lags=as_array(dt * np.arange(-lags, lags + 1)),
-        cross_correlation=as_array(np.concatenate([both[-lags:], both[: lags + 1]]) * absent[:, None]),
+        cross_correlation=as_array(np.concatenate([both[size - lags :], both[: lags + 1]]) * absent[:, None]),
         cross_limit=as_array(ONE_PERCENT * spread * absent[:, None]),
     )

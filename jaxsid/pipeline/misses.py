@@ -73,7 +73,7 @@ def _peaks(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[Peak
     limit = NormalDist().inv_cdf(1 - CHANCE / (2 * tests))
     found = []
     for values, lags, once in parts:
-        known = np.isfinite(values).all(axis=0) & (once > 0) & (len(lags) > 0)
+        known = np.isfinite(values).all(axis=0) & (once > 0)
         if not len(lags):
             nothing = np.full(once.shape, np.nan)
             found.append(Peaks(nothing, nothing, nothing, limit))
