@@ -296,9 +296,9 @@ class Residuals(eqx.Module):
     Attributes:
         lags: (lags,) s.
         autocorrelation: (lags, outputs) of what is left, 1 at lag 0; white noise has 0 elsewhere.
-        cross_correlation: (lags, outputs, inputs) of what is left with each input, from before to after.
+        cross_correlation: (lags, outputs, inputs) of what is left, made white, with each input, from before to after.
         white_limit: what white noise exceeds once in a hundred times.
-        cross_limit: (outputs, inputs) what noise of this colour, independent of the input, exceeds once in a hundred.
+        cross_limit: (outputs, inputs) what noise that is independent of the input exceeds once in a hundred times.
         cross_lags: (lags,) s.
     """
 

