@@ -99,6 +99,13 @@ def identify(
             "records contradict them."
         ),
     ] = Structure.auto,
+    refine: Annotated[
+        bool,
+        typer.Option(
+            help="Fit mass, damping and stiffness to the records; without, those of CBSI alone, without standard "
+            "deviations."
+        ),
+    ] = True,
     quiet: Quiet = False,
 ) -> None:
     """Impulse response, ERA or ERA/DC, modes, mass, damping and stiffness from records."""
@@ -120,6 +127,7 @@ def identify(
             realization=realization.value,
             initial=initial.value,
             structure=structure.value,
+            refine=refine,
             progress=say,
         )
         _write(found, out, say)

@@ -6,7 +6,15 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues
 from jaxsid.realization.stabilization import Stabilization
-from jaxsid.records import ContinuousModel, ImpulseResponse, ModalModel, Realization, Record, SecondOrderModel
+from jaxsid.records import (
+    ContinuousModel,
+    ImpulseResponse,
+    ModalModel,
+    Realization,
+    Record,
+    Residuals,
+    SecondOrderModel,
+)
 
 
 class MatrixDeviation(eqx.Module):
@@ -61,12 +69,18 @@ class Identification(eqx.Module):
         pole_std: (n,) standard deviation of the real part + 1j times that of the imaginary part, 1/s.
         shape_std: (outputs, n) likewise of the shapes as displacements with largest component 1; NaN without matrices.
         cbsi: mass, damping and stiffness by CBSI alone; None where impossible.
-        matrices: mass, damping and stiffness, symmetric, that fit the records best; None where impossible.
-        matrices_std: their standard deviations.
+        refined: whether mass, damping and stiffness were fitted to the records; those of CBSI stand otherwise.
+        matrices: mass, damping and stiffness, symmetric, that fit the records best; without refinement those of CBSI as
+            they come; None where impossible.
+        matrices_std: their standard deviations; None without refinement.
         elements: values of the model's own elements, where their matrices fit the records as well as any; else None.
+        entries: the largest entries of fitted matrices that are not made of elements; else None.
         identified: `matrices` as a model file; None where impossible.
         predictions: response of the identified model to each record's inputs, initial state estimated.
         train_nrmse, noise_floor: (outputs,) rms(y - yhat) / std(y), and what pure noise would leave.
+        nominal_nrmse, cbsi_nrmse, matrices_nrmse: (outputs,) the same of the model that the user gave (its linear
+            part), of CBSI's matrices and of the fitted ones, each from its own initial states; None without them.
+        residuals: correlations of what the predictions leave, one a record; none of an unstable system.
         frequency_fit: measured and modelled frequency responses, one a record.
         warnings: what the user should know.
     """
@@ -87,12 +101,18 @@ class Identification(eqx.Module):
     pole_std: Complex[Array, " n"]
     shape_std: Complex[Array, "outputs n"]
     cbsi: SecondOrderModel | None
+    refined: bool = eqx.field(static=True)
     matrices: SecondOrderModel | None
     matrices_std: MatrixDeviation | None
     elements: ElementValues | None
+    entries: ElementValues | None
     identified: LumpedModel | None
     predictions: tuple[Float[Array, "_ outputs"], ...]
     train_nrmse: Float[Array, " outputs"]
     noise_floor: Float[Array, " outputs"]
+    nominal_nrmse: Float[Array, " outputs"]
+    cbsi_nrmse: Float[Array, " outputs"] | None
+    matrices_nrmse: Float[Array, " outputs"] | None
+    residuals: tuple[Residuals, ...]
     frequency_fit: tuple[FrequencyFit, ...]
     warnings: tuple[str, ...] = eqx.field(static=True)

@@ -288,3 +288,23 @@ class CbsiDiagnostics(eqx.Module):
     damping_asymmetry: Float[Array, ""]
     stiffness_asymmetry: Float[Array, ""]
     negative_scales: Float[Array, ""]
+
+
+class Residuals(eqx.Module):
+    """What a model leaves of a record: is it noise, and has it to do with the inputs?
+
+    Attributes:
+        lags: (lags,) s.
+        autocorrelation: (lags, outputs) of what is left, 1 at lag 0; white noise has 0 elsewhere.
+        cross_correlation: (lags, outputs, inputs) of what is left, made white, with each input, from before to after.
+        white_limit: what white noise exceeds once in a hundred times.
+        cross_limit: (outputs, inputs) what noise that is independent of the input exceeds once in a hundred times.
+        cross_lags: (lags,) s.
+    """
+
+    lags: Float[Array, " lags"]
+    autocorrelation: Float[Array, "lags outputs"]
+    white_limit: float
+    cross_lags: Float[Array, " crosslags"]
+    cross_correlation: Float[Array, "crosslags outputs inputs"]
+    cross_limit: Float[Array, "outputs inputs"]

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues
 from jaxsid.physical.profile import Profile
+from jaxsid.records import Residuals
 
 
 class Validation(eqx.Module):
@@ -24,26 +25,6 @@ class Validation(eqx.Module):
     def better(self) -> bool:
         """Whether the refined model predicts better, over all outputs together."""
         return bool((self.refined**2).mean() < (self.start**2).mean())
-
-
-class Residuals(eqx.Module):
-    """What a refined model leaves of the records: is it noise, and has it to do with the inputs?
-
-    Attributes:
-        lags: (lags,) s.
-        autocorrelation: (lags, outputs) of what is left, 1 at lag 0; white noise has 0 elsewhere.
-        cross_correlation: (lags, outputs, inputs) of what is left with each input, from before to after.
-        white_limit: what white noise exceeds once in a hundred times.
-        cross_limit: (outputs, inputs) what noise of this colour, independent of the input, exceeds once in a hundred.
-        cross_lags: (lags,) s.
-    """
-
-    lags: Float[Array, " lags"]
-    autocorrelation: Float[Array, "lags outputs"]
-    white_limit: float
-    cross_lags: Float[Array, " crosslags"]
-    cross_correlation: Float[Array, "crosslags outputs inputs"]
-    cross_limit: Float[Array, "outputs inputs"]
 
 
 class Refinement(eqx.Module):

@@ -14,6 +14,7 @@ from jaxsid.mechanics.lumped import Connection, Input, LumpedModel, Sensor, lump
 from jaxsid.mechanics.simulate import impulse_response_of
 from jaxsid.modes import modal
 from jaxsid.physical.elements import ElementValues, element_matrices
+from jaxsid.pipeline.fit import residuals_of
 from jaxsid.realization.era import era
 from jaxsid.realization.stabilization import stabilization
 from jaxsid.records import CbsiDiagnostics, ImpulseResponse, Record, SecondOrderModel
@@ -85,13 +86,19 @@ def identification(samples: int = 4000) -> Identification:
         pole_std=(3e-4 + 2e-4j) * found_modal.frequencies,
         shape_std=jnp.full((3, n), 0.002 + 0.001j),
         cbsi=dataclasses.replace(matrices, diagnostics=diagnostics),
+        refined=True,
         matrices=matrices,
         matrices_std=deviation,
         elements=None,
+        entries=None,
         identified=chain(1.001),
         predictions=(jnp.asarray(clean),),
         train_nrmse=jnp.asarray(rest * [1.0, 1.3, 3.1]),
         noise_floor=jnp.asarray(rest),
+        nominal_nrmse=jnp.asarray([0.4, 0.5, 300.0]),
+        cbsi_nrmse=jnp.asarray(rest * [1.1, 1.5, 3.5]),
+        matrices_nrmse=jnp.asarray(rest * [1.0, 1.3, 3.1]),
+        residuals=residuals_of((record,), ("acc1", "acc2", "acc3"), (jnp.asarray(clean),)),
         frequency_fit=(frequency_fit(record, matrices),),
         warnings=(WARNING,),
     )
@@ -138,5 +145,6 @@ def without_matrices(found: Identification) -> Identification:
     fit = tuple(dataclasses.replace(x, matrices=None) for x in found.frequency_fit)
     return dataclasses.replace(
         found, matrices=None, matrices_std=None, cbsi=None, identified=None, frequency_fit=fit,
+        cbsi_nrmse=None, matrices_nrmse=None,
         modal=dataclasses.replace(found.modal, indicators=None),
     )  # fmt: skip

@@ -136,6 +136,36 @@ def test_identify_writes_numbers_model_and_report(files):
     assert (np.std(y[:, 1:] - truth[:, 2:], axis=0) / np.std(truth[:, 2:], axis=0)).max() < 0.011
 
 
+def test_without_refinement(files, columns):
+    model, record, out = files
+    result = call("identify", model, record, "--out", out, "--no-refine")
+    assert result.exit_code == 0, result.output
+    found = identified(out)
+    assert found["std"] is found["elements"] is found["correlation"] is None
+    assert found["refined"] is False
+    for name in ("mass", "damping", "stiffness"):
+        assert found[name] == found["cbsi"][name]
+        limit = 0.1 if name == "damping" else 0.02
+        assert max(error(found[name], getattr(SYSTEM, name))) < limit
+    assert set(found["fit"]["cbsi_nrmse"]) == {"s1", "s2", "s3"}
+    assert found["fit"]["matrices_nrmse"] is None
+    assert any("Nothing was refined" in w for w in found["warnings"])
+    assert "Nothing was refined" in " ".join(result.stdout.split())
+    assert "CBSI alone" in " ".join(result.stdout.split())
+    assert "nothing was refined" in (out / "report.html").read_text()
+    predicted = out / "predicted.csv"
+    assert call("simulate", out / "model.toml", record, "--out", predicted).exit_code == 0
+    y, truth = (np.loadtxt(p, delimiter=",", skiprows=1) for p in (predicted, record))
+    assert (np.std(y[:, 1:] - truth[:, 2:], axis=0) / np.std(truth[:, 2:], axis=0)).max() < 0.02
+    two = write_csv(out.parent / "two.csv", {n: x for n, x in columns.items() if n != "s3"})
+    other = out.parent / "two"
+    assert call("identify", model, two, "--out", other, "--no-refine").exit_code == 0
+    assert identified(other)["mass"] is identified(other)["fit"]["cbsi_nrmse"] is None
+    assert not (other / "model.toml").exists()
+    refused(call("identify", model, record, "--out", out / "x", "--no-refine", "--structure", "model"), out / "x", 2,
+            "refine=False")  # fmt: skip
+
+
 def test_quiet_says_nothing(files):
     model, record, out = files
     result = call("identify", model, record, "--out", out, "--quiet")

@@ -120,7 +120,7 @@ def test_names_are_unique_and_links_lead_somewhere(reader, html):
 
 def test_figures_follow_the_colours_of_the_page(html):
     drawings = re.findall(r"<svg.*?</svg>", html, re.DOTALL)
-    assert len(drawings) == 11  # 3 in time, 3 in frequency, shapes, poles, order twice, impulse
+    assert len(drawings) == 12  # 3 in time, 3 in frequency, shapes, poles, order twice, impulse, residuals
     for drawing in drawings:
         assert 'role="img"' in drawing
         assert "var(--ink)" in drawing
@@ -145,12 +145,13 @@ def test_report_without_matrices_and_indicators(found):
 
 
 def test_report_with_nothing_but_modes(found):
-    """No warnings, no frequency responses, NaN for what is unknown, a Laguerre basis, an absent sensor."""
+    """No warnings, frequency responses, residuals, NaN for what is unknown, a Laguerre basis, an absent sensor."""
     unknown = jnp.full(3, np.nan)
     y = np.asarray(found.records[0].y)[:, :2]
     record = Record(found.records[0].u, y, 0.005, inputs=("force",), outputs=("acc1", "acc2"), name="roving")
     bare = dataclasses.replace(
         without_matrices(found), frequency_fit=(), warnings=(), train_nrmse=unknown, noise_floor=unknown,
+        nominal_nrmse=unknown, residuals=(),
         records=(record, record), predictions=found.predictions * 2,
         response=ImpulseResponse(found.response.h, 0.005, pole=0.8),
         frequency_std=jnp.full(6, jnp.nan), damping_ratio_std=jnp.full(6, jnp.nan),
@@ -191,6 +192,7 @@ def test_many_sensors_show_the_worst(found):
         without_matrices(found), nominal=nominal, outputs=names, frequency_fit=(),
         records=(Record(record.u, y, record.dt, inputs=("force",), outputs=names),),
         predictions=(jnp.asarray(0.9 * y),), train_nrmse=jnp.linspace(0.01, 0.4, count),
+        nominal_nrmse=jnp.ones(count), residuals=(),
         noise_floor=jnp.full(count, 0.01), shape_std=jnp.full((count, 6), 0.01 + 0.01j),
         modal=dataclasses.replace(
             without_matrices(found).modal,

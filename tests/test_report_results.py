@@ -44,7 +44,8 @@ def test_schema_of_the_contract(found, tmp_path):
     assert first["std"]["pole"] == [found.pole_std[0].real, found.pole_std[0].imag]
     assert max(abs(complex(*x)) for x in first["shape"].values()) == pytest.approx(1.0)
     assert first["std"]["shape"]["acc2"] == [0.002, 0.001]
-    assert set(data["fit"]) == {"train_nrmse", "noise_floor"}
+    more = {"nominal_nrmse", "cbsi_nrmse", "matrices_nrmse"}
+    assert set(data["fit"]) == {"train_nrmse", "noise_floor"} | more
     assert data["fit"]["train_nrmse"]["acc3"] == float(found.train_nrmse[2])
     assert data["warnings"] == [WARNING]
     assert data["bodies"] == ["base", "middle", "top"]

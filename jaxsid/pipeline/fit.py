@@ -13,7 +13,8 @@ from jaxsid.impulse.spectra import frequency_response
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.simulate import estimate_initial_state, simulate_linear
-from jaxsid.records import ContinuousModel, Record, SecondOrderModel, as_array
+from jaxsid.pipeline.correlations import correlations
+from jaxsid.records import ContinuousModel, Record, Residuals, SecondOrderModel, as_array
 
 
 class TimeFit(NamedTuple):
@@ -45,11 +46,8 @@ def time_fit(
     predictions, left, floor, size = [], *(np.zeros(len(outputs)) for _ in range(3))
     owner = np.where(np.asarray(lines.weight).any(axis=1), np.asarray(lines.record).argmax(axis=1), -1)
     for i, r in enumerate(records):
-        rows = [outputs.index(n) for n in r.outputs]
-        measured, samples = np.asarray(r.y), len(r.y)
-        whole = np.full((samples, len(outputs)), np.nan)
-        whole[:, rows] = measured
-        predictions.append(_prediction(model, r, whole, at_rest))
+        rows, measured, samples = [outputs.index(n) for n in r.outputs], np.asarray(r.y), len(r.y)
+        predictions.append(_prediction(model, r, outputs, at_rest))
         error = measured - np.asarray(predictions[-1])[:, rows]
         level = np.asarray(noise)[owner == i][:, rows] ** 2
         inside = 2 * level.sum(axis=0)
@@ -72,11 +70,54 @@ def no_time_fit(records: Sequence[Record], outputs: Sequence[str]) -> TimeFit:
     return TimeFit(empty, nothing, nothing)
 
 
-def _prediction(model: ContinuousModel, record: Record, y: np.ndarray, at_rest: bool) -> Array:
-    """All outputs, from the initial state that fits the measured ones, NaN elsewhere in y."""
+def time_errors(
+    model: SecondOrderModel, records: Sequence[Record], outputs: Sequence[str], at_rest: bool
+) -> np.ndarray:
+    """rms(y - yhat) / std(y) of each output over all records; NaN where the model's motion grows beyond all numbers.
+
+    Args:
+        model: mass, damping, stiffness, its outputs in the order of `outputs`.
+        records: what was measured.
+        outputs: names of the model's outputs.
+        at_rest: start from rest instead of the initial state that fits best.
+    """
+    linear, left, size = physical_displacement_velocity(model), *(np.zeros(len(outputs)) for _ in range(2))
+    for r in records:
+        rows, measured = [outputs.index(n) for n in r.outputs], np.asarray(r.y)
+        predicted = np.asarray(_prediction(linear, r, outputs, at_rest))[:, rows]
+        with np.errstate(over="ignore", invalid="ignore"):
+            left[rows] += ((measured - predicted) ** 2).sum(axis=0)
+        size[rows] += len(measured) * measured.var(axis=0)
+    left = np.where(np.isfinite(left), left, np.nan)
+    return np.sqrt(left / np.where(size > 0, size, 1.0))
+
+
+def residuals_of(
+    records: Sequence[Record], outputs: Sequence[str], predictions: Sequence[Array]
+) -> tuple[Residuals, ...]:
+    """Correlations of what is left of each record with itself and with the inputs.
+
+    Args:
+        records: what was measured.
+        outputs: names of the columns of the predictions.
+        predictions: one a record.
+    """
+    found = []
+    for r, predicted in zip(records, predictions, strict=True):
+        rows = [outputs.index(n) for n in r.outputs]
+        error = np.full(predicted.shape, np.nan)
+        error[:, rows] = np.asarray(r.y) - np.asarray(predicted)[:, rows]
+        found.append(correlations(error, np.asarray(r.u), float(r.dt)))
+    return tuple(found)
+
+
+def _prediction(model: ContinuousModel, record: Record, outputs: Sequence[str], at_rest: bool) -> Array:
+    """All outputs, from the initial state that fits the measured ones."""
     sampled = discretise(model, record.dt, hold=record.hold)
     if at_rest:
         return simulate_linear(sampled, record.u)
+    y = np.full((len(record.y), len(outputs)), np.nan)
+    y[:, [outputs.index(n) for n in record.outputs]] = np.asarray(record.y)
     state = estimate_initial_state(sampled, record.u, y).state
     return simulate_linear(sampled, record.u, initial_state=state)
 

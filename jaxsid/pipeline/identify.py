@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Array
 
 from jaxsid.checks import InsufficientDataError, check_excitation, require
 from jaxsid.identification import Identification, MatrixDeviation
@@ -11,12 +12,15 @@ from jaxsid.impulse.protocol import ImpulseMethod
 from jaxsid.mechanics.lumped import LumpedModel, Matrices, lumped_model
 from jaxsid.mechanics.simulate import markov_parameters
 from jaxsid.physical.elements import ElementValues, with_values
-from jaxsid.pipeline.fit import frequency_fits, no_time_fit, time_fit
-from jaxsid.pipeline.matrices import POOR, Found, find_matrices
+from jaxsid.pipeline.before_after import before_after
+from jaxsid.pipeline.entries import fitted_entries
+from jaxsid.pipeline.fit import TimeFit, frequency_fits, no_time_fit, residuals_of, time_fit
+from jaxsid.pipeline.matrices import Found, explained, find_matrices
+from jaxsid.pipeline.misses import input_warning
 from jaxsid.pipeline.modes import FinalModes, final_modes
 from jaxsid.pipeline.setting import Setting, setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
-from jaxsid.records import Record, SecondOrderModel, as_array
+from jaxsid.records import Record, Residuals, SecondOrderModel, as_array
 
 LONGEST_RESPONSE = 8192  # samples of the impulse response that is reported
 STRUCTURES = ("auto", "free", "model")
@@ -33,6 +37,7 @@ def identify(
     realization: str = "era",
     initial: str = "estimate",
     structure: str = "auto",
+    refine: bool = True,
     progress: Progress | None = None,
 ) -> Identification:
     """Impulse response, state-space model, modes and M, D, K of a system, from records of its inputs and outputs.
@@ -52,6 +57,8 @@ def identify(
         initial: "estimate" each record's initial state, or take it to be at "rest", for the comparison in time.
         structure: "free" for symmetric mass, damping and stiffness; "model" for those that the model's elements can
             make; "auto" for the latter unless the records contradict them (chi-squared test at 1 %).
+        refine: fit mass, damping and stiffness to the lines; False leaves those of CBSI alone, without standard
+            deviations, and none where a body has no sensor.
         progress: called with a line of text as each stage begins.
 
     Returns:
@@ -67,6 +74,10 @@ def identify(
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose estimate or rest.")
     require(structure in STRUCTURES, f"structure '{structure}' is unknown; choose {' or '.join(STRUCTURES)}.")
+    require(
+        refine or structure != "model",
+        "structure 'model' asks for a fit of the model's elements, which refine=False leaves out: choose one of both.",
+    )
     system = setting(model, records)
     _check_records(model, records, order or system.visible)
     say("impulse response in the excited band")
@@ -79,14 +90,13 @@ def identify(
         found = _not_this_order(system)
     else:
         found = (
-            find_matrices(model, system, space, structure)
+            find_matrices(model, system, space, structure, refine=refine)
             if space.stable
             else Found(None, None, None, None, ())
         )
-    explained = found.fit is not None and float(found.fit.misfit) < POOR
     say("modes, fit")
-    final = final_modes(space, found.model if explained else None, found.fit if explained else None)
-    return _collect(model, records, system, space, found, final, initial == "rest")
+    final = final_modes(space, *((found.model, found.fit) if explained(found) else (None, None)))
+    return _collect(model, records, system, space, found, final, refine, initial == "rest")
 
 
 def _collect(
@@ -96,6 +106,7 @@ def _collect(
     space: StateSpace,
     found: Found,
     final: FinalModes,
+    refine: bool,
     at_rest: bool,
 ) -> Identification:
     """The stages' results in one value, with the comparison in time and in frequency."""
@@ -105,6 +116,8 @@ def _collect(
         if space.stable
         else no_time_fit(records, system.outputs)
     )
+    errors = before_after(model, records, system, found, times, at_rest)
+    residuals = residuals_of(records, system.outputs, times.predictions) if space.stable else ()
     return Identification(
         nominal=model,
         records=records,
@@ -122,22 +135,28 @@ def _collect(
         pole_std=final.pole_std,
         shape_std=final.shape_std,
         cbsi=found.cbsi,
+        refined=refine,
         matrices=found.model,
         matrices_std=None if found.fit is None else _deviation(found),
         elements=found.elements,
-        identified=None if found.model is None else identified_model(model, found.model, found.elements),
+        entries=fitted_entries(found.fit, model)
+        if found.fit is not None and found.elements is None
+        else None,
+        identified=_identified(model, found),
         predictions=times.predictions,
         train_nrmse=as_array(times.nrmse),
         noise_floor=as_array(times.floor),
+        nominal_nrmse=errors.nominal,
+        cbsi_nrmse=errors.cbsi,
+        matrices_nrmse=errors.matrices,
+        residuals=residuals,
         frequency_fit=frequency_fits(
             records, system.outputs, final.continuous, found.model, np.asarray(lines.band).tolist()
         ),
         warnings=(
             *_about_records(records, lines),
-            *space.warnings,
-            *_left_out(model),
-            *found.warnings,
-            *_missing(model, system),
+            *(*space.warnings, *_left_out(model), *found.warnings, *_missing(model, system)),
+            *_inputs_left(residuals, records, system, times),
         ),
     )
 
@@ -163,6 +182,17 @@ def _row_sums(slopes: np.ndarray) -> np.ndarray:
     return np.where(np.abs(total) > 8 * np.finfo(slopes.dtype).eps * size, total, 0.0)
 
 
+def _identified(model: LumpedModel, found: Found) -> LumpedModel | None:
+    """The model file's model; None where CBSI's mass, made symmetric, is none."""
+    if found.model is None or np.linalg.eigvalsh(_symmetric(found.model.mass))[0] <= 0:
+        return None
+    return identified_model(model, found.model, found.elements)
+
+
+def _symmetric(matrix: Array) -> np.ndarray:
+    return 0.5 * (np.asarray(matrix) + np.asarray(matrix).T)
+
+
 def identified_model(
     nominal: LumpedModel, found: SecondOrderModel, elements: ElementValues | None = None
 ) -> LumpedModel:
@@ -175,8 +205,7 @@ def identified_model(
     """
     if elements is not None:
         return with_values(nominal, elements.values)
-    symmetric = [np.asarray(x) for x in (found.mass, found.damping, found.stiffness)]
-    mass, damping, stiffness = (0.5 * (x + x.T) for x in symmetric)
+    mass, damping, stiffness = (_symmetric(x) for x in (found.mass, found.damping, found.stiffness))
     return lumped_model(
         nominal.bodies,
         matrices=Matrices(as_array(mass), as_array(damping), as_array(stiffness)),
@@ -200,6 +229,13 @@ def _about_records(records: Sequence[Record], lines: Lines) -> tuple[str, ...]:
             "all estimates come from that band.",
         )
     return ()
+
+
+def _inputs_left(
+    residuals: Sequence[Residuals], records: Sequence[Record], system: Setting, times: TimeFit
+) -> tuple[str, ...]:
+    names, inputs = [r.name for r in records], [r.inputs for r in records]
+    return input_warning(residuals, names, system.outputs, inputs, times.nrmse) if residuals else ()
 
 
 def _missing(model: LumpedModel, system: Setting) -> tuple[str, ...]:

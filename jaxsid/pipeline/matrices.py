@@ -22,7 +22,7 @@ from jaxsid.pipeline.structure import (
     uncontradicted,
     undetermined,
 )
-from jaxsid.records import SecondOrderModel, as_array
+from jaxsid.records import CbsiDiagnostics, SecondOrderModel, as_array
 
 GOOD = 1.5  # mean square residual, in units of the noise, that leaves nothing to look for
 AT_THE_EDGE = (
@@ -31,6 +31,15 @@ AT_THE_EDGE = (
     "place is wrong, or for dynamics that the bodies do not have."
 )
 POOR = 3.0  # one that the user must hear of
+UNREFINED = (
+    "Nothing was refined, as asked for: no mass, damping and stiffness were fitted to the records, and matrices have "
+    "no standard deviations."
+)
+BY_CBSI = (
+    "Mass, damping and stiffness are those of CBSI alone, as they come: less exact than those of a fit, and symmetric "
+    "only as far as noise lets them; the model file holds their symmetric parts. Modes are of the state-space model."
+)
+NO_STRUCTURE = "Only the fit that was left out could make up for missing sensors, by the model's structure."
 
 
 class Found(NamedTuple):
@@ -43,7 +52,18 @@ class Found(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, structure: str) -> Found:
+def explained(found: Found) -> bool:
+    """Whether fitted matrices say all that the state-space model says.
+
+    Args:
+        found: matrices.
+    """
+    return found.fit is not None and float(found.fit.misfit) < POOR
+
+
+def find_matrices(
+    model: LumpedModel, system: Setting, space: StateSpace, structure: str, *, refine: bool = True
+) -> Found:
     """Mass, damping and stiffness: free symmetric matrices, or the values of the model's elements.
 
     Args:
@@ -51,8 +71,11 @@ def find_matrices(model: LumpedModel, system: Setting, space: StateSpace, struct
         system: sensors and places.
         space: the state-space model.
         structure: "free" for symmetric matrices, "model" for its elements, "auto" for these if they fit as well.
+        refine: fit to the lines; otherwise CBSI has the last word.
     """
     sensed = sensed_rows(model, system)
+    if not refine:
+        return _cbsi_alone(model, system, space, sensed)
     target = fit_target(space.lines, space.polished.noise, space.polished.realization, space.model)
     if system.one_a_body is None:
         return _by_elements_alone(model, system, space, target, sensed, structure)
@@ -108,8 +131,22 @@ def _found(
 ) -> Found:
     if fit is None:
         return Found(structured, None, None, None, notes)
-    mass, damping, stiffness = fit.matrices
-    found = SecondOrderModel(
+    diagnostics = None if structured is None else structured.diagnostics
+    return Found(structured, fit, with_matrices(sensed, fit.matrices, diagnostics), elements, notes)
+
+
+def with_matrices(
+    sensed: SecondOrderModel, matrices: Triple, diagnostics: CbsiDiagnostics | None = None
+) -> SecondOrderModel:
+    """The same inputs and sensors with other M, D, K.
+
+    Args:
+        sensed: gives the input matrix and the sensors.
+        matrices: M, D, K.
+        diagnostics: what CBSI noticed.
+    """
+    mass, damping, stiffness = matrices
+    return SecondOrderModel(
         mass,
         damping,
         stiffness,
@@ -117,9 +154,20 @@ def _found(
         sensed.displacement_sensors,
         sensed.velocity_sensors,
         sensed.acceleration_sensors,
-        diagnostics=None if structured is None else structured.diagnostics,
+        diagnostics,
     )
-    return Found(structured, fit, found, elements, notes)
+
+
+def _cbsi_alone(model: LumpedModel, system: Setting, space: StateSpace, sensed: SecondOrderModel) -> Found:
+    """What there is without any fit: CBSI's matrices as they come, or none."""
+    if system.one_a_body is None:
+        return Found(None, None, None, None, (_too_few(model, system), NO_STRUCTURE, UNREFINED))
+    structured, trouble = _cbsi(system, space)
+    if structured is None:
+        return Found(None, None, None, None, (*trouble, UNREFINED))
+    matrices = structured.mass, structured.damping, structured.stiffness
+    found = with_matrices(sensed, matrices, structured.diagnostics)
+    return Found(structured, None, found, None, (*_negative_scales(structured), UNREFINED, BY_CBSI))
 
 
 def _by_elements_alone(
@@ -213,9 +261,7 @@ def _cbsi(system: Setting, space: StateSpace) -> tuple[SecondOrderModel | None, 
     except JaxsidError as trouble:
         return None, (f"CBSI was left out: {trouble}",)
     if not all(np.isfinite(x).all() for x in (found.mass, found.damping, found.stiffness)):
-        return None, (
-            "CBSI found no scale for a mode that the inputs hardly drive; the fit to the lines goes on.",
-        )
+        return None, ("CBSI found no scale for a mode that the inputs hardly drive.",)
     return found, ()
 
 
@@ -317,17 +363,18 @@ def _vague(fit: MatrixFit) -> list[str]:
     return [name for name, (spread, size) in zip(names, sizes, strict=True) if not spread < size]
 
 
+def _negative_scales(structured: SecondOrderModel | None) -> tuple[str, ...]:
+    diagnostics = None if structured is None else structured.diagnostics
+    if diagnostics is None or int(diagnostics.negative_scales) == 0:
+        return ()
+    return (
+        f"CBSI met {int(diagnostics.negative_scales)} mode(s) with a negative scale: shape and driving point "
+        "contradict each other. Check polarity, place and gain of sensors and inputs.",
+    )
+
+
 def _notes(fit: MatrixFit | None, structured: SecondOrderModel | None) -> tuple[str, ...]:
-    notes = []
-    if (
-        structured is not None
-        and structured.diagnostics is not None
-        and int(structured.diagnostics.negative_scales) > 0
-    ):
-        notes.append(
-            f"CBSI met {int(structured.diagnostics.negative_scales)} mode(s) with a negative scale: shape and driving "
-            "point contradict each other. Check polarity, place and gain of sensors and inputs."
-        )
+    notes = list(_negative_scales(structured))
     if fit is not None and (vague := _vague(fit)):
         notes.append(
             f"The records hardly determine the {' and '.join(vague)}: standard deviations exceed the values. Excite a "

@@ -15,10 +15,11 @@ from jaxsid.physical.elements import LinearMatrices, element_matrices, with_valu
 from jaxsid.physical.motion import Left, MotionTerm, counted
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.correlations import correlations
+from jaxsid.pipeline.misses import with_input_warning
 from jaxsid.pipeline.motion_terms import Windows, lowest_frequency, motion_term, window_length
 from jaxsid.pipeline.refining import Manner, Problem, concluded, nominal_unknowns, solved
-from jaxsid.records import Record, as_array
-from jaxsid.refinement import Refinement, Residuals, Validation
+from jaxsid.records import Record, Residuals, as_array
+from jaxsid.refinement import Refinement, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
 ROUNDS = 2  # fits after which level and colour of the noise, and then the windows, are found anew
@@ -66,7 +67,8 @@ def refine_motion(
     def residuals(_: LumpedModel) -> Residuals:
         return _residuals(terms, cuts, fit)
 
-    return concluded(problem, model, fit, spread, outputs, errors, validation, residuals)
+    found = concluded(problem, model, fit, spread, outputs, errors, validation, residuals)
+    return with_input_warning(found)
 
 
 def _settled(

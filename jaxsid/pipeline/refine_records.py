@@ -8,18 +8,19 @@ import numpy as np
 from jaxsid.checks import InsufficientDataError
 from jaxsid.impulse.lines import Lines, record_lines
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.mechanics.simulate import simulate
+from jaxsid.mechanics.simulate import ordered_inputs, simulate
 from jaxsid.physical.inband_fit import Target, fit_target
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.physical.terms import LineTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.matrices import sensed_rows
+from jaxsid.pipeline.misses import with_input_warning
 from jaxsid.pipeline.refining import Manner, Problem, concluded, fitted_model, nominal_unknowns, solved
 from jaxsid.pipeline.setting import setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
-from jaxsid.records import Record, as_array
-from jaxsid.refinement import Refinement, Residuals, Validation
+from jaxsid.records import Record, Residuals, as_array
+from jaxsid.refinement import Refinement, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
 Pair = tuple[float, float]
@@ -76,7 +77,8 @@ def refine_records(
             as_array(errors(model, late)), as_array(errors(trained, late)), "the last quarter of every record"
         )
     residuals = lambda m: _residuals(m, records, system.outputs)  # noqa: E731
-    return concluded(problem, model, fit, None, system.outputs, errors, validation, residuals)
+    found = concluded(problem, model, fit, None, system.outputs, errors, validation, residuals)
+    return with_input_warning(found)
 
 
 def _target(space: StateSpace, lines: Lines, noise: np.ndarray) -> Target:
@@ -152,4 +154,4 @@ def _residuals(model: LumpedModel, records: Sequence[Record], outputs: Sequence[
     record = max(records, key=lambda r: (len(r.outputs), len(r.y)))
     error = np.full((len(record.y), len(outputs)), np.nan)
     error[:, [outputs.index(n) for n in record.outputs]] = _left(model, record)
-    return correlations(error, np.asarray(record.u), float(record.dt))
+    return correlations(error, np.asarray(ordered_inputs(model, record)[0]), float(record.dt))

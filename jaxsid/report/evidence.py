@@ -25,6 +25,10 @@ from jaxsid.report.plots.impulse import ROWS, plain_time
 from jaxsid.report.results import MATRICES
 
 TIME_FIGURES, FREQUENCY_FIGURES, SHAPES, IMPULSES = 6, 6, 8, 3
+REFINED = (
+    ", which a least-squares fit to the records then refines: with the values of the nominal model's own masses, "
+    "springs and dampers unless the records contradict that structure, else with free symmetric matrices. "
+)
 REFERENCES = (
     Link(
         "J.-N. Juang and R. S. Pappa, An eigensystem realization algorithm for modal parameter "
@@ -179,10 +183,11 @@ def cbsi_section(found: Identification) -> Section:
     diagnostics = None if found.cbsi is None else found.cbsi.diagnostics
     if diagnostics is None:
         return Section("Consistency with a mechanical system", ())
+    role = "the starting point of the fit" if found.refined else "what is reported, since nothing was refined"
     intro = (
-        "CBSI turns the state-space model into mass, damping and stiffness directly; its result is the "
-        "starting point of the fit. A state-space model of a real mechanical system passes these tests "
-        "with 0; noise, missing modes and wrong sensor positions do not."
+        f"CBSI turns the state-space model into mass, damping and stiffness directly; its result is {role}. "
+        "A state-space model of a real mechanical system passes these tests with 0; noise, missing modes and wrong "
+        "sensor positions do not."
     )
     header = ("Test", "Value", "Meaning")
     return Section(
@@ -243,10 +248,9 @@ def method_section(found: Identification) -> Section:
         "algorithm (ERA, or ERA/DC on its correlations) factors the block Hankel matrix of its samples "
         "and gives a state-space model; the eigenvalues are the poles, the eigenvectors seen by the "
         "sensors the mode shapes. Where sensors and inputs allow it, common-basis structural "
-        "identification (CBSI) turns the model into mass, damping and stiffness, which a least-squares "
-        "fit to the records then refines: with the values of the nominal model's own masses, springs and "
-        "dampers unless the records contradict that structure, else with free symmetric matrices. "
-        "Standard deviations follow from the noise of the records, to first order. The numbers of the "
+        "identification (CBSI) turns the model into mass, damping and stiffness"
+        + (REFINED if found.refined else ". The fit that refines them was left out. ")
+        + "Standard deviations follow from the noise of the records, to first order. The numbers of the "
         "nominal model are compared with, and are no prior."
     )
     return Section("How it was computed", (Text(words), Links(REFERENCES)))

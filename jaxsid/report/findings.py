@@ -3,13 +3,12 @@
 import numpy as np
 
 from jaxsid.identification import Identification
-from jaxsid.mechanics.lumped import LumpedModel, second_order
-from jaxsid.physical.elements import ElementValues
+from jaxsid.mechanics.lumped import second_order
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
-from jaxsid.report.modes import Mode, connecting, modes_of, worst_fits
-from jaxsid.report.numbers import MISSING, TIMES, change, percent, plural, significant, with_std
+from jaxsid.report.modes import Mode, compared, connecting, modes_of, worst_fits
+from jaxsid.report.numbers import MISSING, TIMES, change, misfit, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
-from jaxsid.report.units import Units, units_of
+from jaxsid.report.units import units_of
 
 NO_MATRICES = (
     "These records do not determine the matrices. One driving point (a force and a sensor on the same "
@@ -17,6 +16,10 @@ NO_MATRICES = (
     "hold all the same."
 )
 FREE = "Symmetric matrices that fit the records best, in the order of the bodies."
+UNREFINED = (
+    "Matrices of CBSI alone, as they come, in the order of the bodies: nothing was refined, so that they need not be "
+    "symmetric and have no standard deviations."
+)
 BY_ELEMENTS = (
     "Made of the model's own masses, springs and dampers, whose values were fitted to the records; entries which the "
     "model does not have are zero."
@@ -128,7 +131,8 @@ def matrices_section(found: Identification) -> Section:
     """Mass, damping and stiffness with deviations, or why there are none."""
     if found.matrices is None:
         return Section("Mass, damping, stiffness", (Text(NO_MATRICES),))
-    blocks: list[Block] = [Text(FREE if found.elements is None else BY_ELEMENTS)]
+    origin = UNREFINED if not found.refined else FREE if found.elements is None else BY_ELEMENTS
+    blocks: list[Block] = [Text(origin)]
     if len(found.matrices.mass) <= TABLED:
         blocks.append(Tables(tuple(_matrix(found, which) for which in MATRICES)))
     elements = _elements(found)
@@ -166,11 +170,9 @@ def _beside(value: float, nominal: float) -> str:
 
 
 def _elements(found: Identification) -> Table | None:
-    """Bodies and connections one by one: as fitted, or else read off the matrices of a model made of them."""
-    if found.elements is not None:
-        return elements_table(found.elements, found.nominal)
+    """Bodies and connections one by one, read off the matrices where these were not fitted by them."""
     model = found.nominal
-    if found.matrices is None or model.matrices is not None:
+    if found.matrices is None or found.elements is not None or model.matrices is not None:
         return None
     units = units_of(model)
     mass, std = np.diag(np.asarray(found.matrices.mass)), found.matrices_std
@@ -188,45 +190,9 @@ def _elements(found: Identification) -> Table | None:
         "the sign changed, one to ground the sum of a row. Below each nominal value: the change from "
         "it."
     )
-    return Table(_element_header(units), tuple(rows), _element_title(units), note)
-
-
-def _element_header(units: Units) -> tuple[str, ...]:
-    return "Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal"
-
-
-def _element_title(units: Units) -> str:
-    return f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
-
-
-def elements_table(elements: ElementValues, model: LumpedModel) -> Table:
-    """Fitted values of bodies and connections with standard deviations, beside the nominal ones.
-
-    Args:
-        elements: the values.
-        model: nominal, whose elements they are.
-    """
-    units = units_of(model)
-    cells = {
-        (unknown.element, unknown.quantity): _beside_nominal(float(value), float(std), float(nominal))
-        for unknown, value, std, nominal in zip(
-            elements.listed, elements.values, elements.deviation, elements.nominal, strict=True
-        )
-    }
-    nothing = ("", "")
-    between = {c.name: f" {MISSING} ".join(c.between) for c in model.connections}
-    bodies = [(e, *cells[e, q], *nothing) for e, q in cells if q == "mass"]
-    joints = dict.fromkeys(e for e, q in cells if q != "mass")
-    rows = [
-        (
-            Cell(e, between.get(e, "")),
-            *cells.get((e, "stiffness"), nothing),
-            *cells.get((e, "damping"), nothing),
-        )
-        for e in joints
-    ]
-    note = "± one standard deviation. Below each nominal value: the change from it."
-    return Table(_element_header(units), (*bodies, *rows), _element_title(units), note)
+    header = "Element", f"{units.name('mass').capitalize()} or stiffness", "Nominal", "Damping", "Nominal"
+    title = f"Elements ({units.symbol('mass')}, {units.symbol('stiffness')}, {units.symbol('damping')})"
+    return Table(header, tuple(rows), title, note)
 
 
 def _connection(found: Identification, i: int) -> tuple[str | Cell, ...]:
@@ -246,23 +212,25 @@ def _beside_nominal(value: float, std: float, nominal: float) -> tuple[str, Cell
 
 
 def fit_section(found: Identification) -> Section:
-    """How closely the model follows each sensor."""
-    rows = tuple(
-        _fit_row(found.outputs[i], float(found.train_nrmse[i]), float(found.noise_floor[i]))
-        for i in worst_fits(found)
-    )
-    header = ("Sensor", "Misfit (NRMSE)", "Noise floor", "Ratio", "Reading")
+    """How closely the models follow each sensor, before and after."""
+    models = compared(found)
+    rows = tuple(_fit_row(found, i, models) for i in worst_fits(found))
+    header = ("Sensor", *(name for name, _ in models), "Noise floor", "Ratio", "Reading")
     note = (
-        "NRMSE: rms of measured less modelled, over the standard deviation of the measured signal. "
-        "Noise floor: what a perfect model would leave. A ratio near 1 means that nothing but noise is "
-        "left; well above, the system does something that a linear model of this kind does not."
+        "NRMSE: rms of measured less modelled, over the standard deviation of the measured signal, all records, each "
+        "model from its own best initial state. Noise floor: what a perfect model would leave. Ratio: of the model "
+        "before the floor, to it. Near 1 nothing but noise is left; well above, the system does something that a "
+        "linear model of this kind does not."
     )
+    if found.nominal.effects:
+        note += " The nominal model is taken without its effects."
     if len(rows) < len(found.outputs):
         note = f"The {len(rows)} worst of {len(found.outputs)} sensors. " + note
-    return Section("Fit", (Table(header, rows, "", note),))
+    return Section("Fit", (Table(header, rows, "Misfit (NRMSE), before and after", note),))
 
 
-def _fit_row(name: str, nrmse: float, floor: float) -> tuple[str | Cell, ...]:
+def _fit_row(found: Identification, i: int, models: list[tuple[str, np.ndarray]]) -> tuple[str | Cell, ...]:
+    nrmse, floor = float(found.train_nrmse[i]), float(found.noise_floor[i])
     ratio = nrmse / floor if floor > 0 else float("nan")
     reading, tone = "noise floor unknown", ""
     if ratio <= GOOD_FIT:
@@ -271,4 +239,5 @@ def _fit_row(name: str, nrmse: float, floor: float) -> tuple[str | Cell, ...]:
         reading, tone = "far above noise", "warning"
     elif ratio > GOOD_FIT:
         reading = "above noise"
-    return name, percent(nrmse), percent(floor), significant(ratio, 3), Cell(reading, tone=tone)
+    shares = (misfit(float(values[i])) for _, values in models)
+    return found.outputs[i], *shares, percent(floor), significant(ratio, 3), Cell(reading, tone=tone)

@@ -16,6 +16,8 @@ from jaxsid.report.evidence import (
 from jaxsid.report.findings import fit_section, key_findings, matrices_section
 from jaxsid.report.frame import Gallery, Section, page
 from jaxsid.report.numbers import plural, significant
+from jaxsid.report.parameters import parameters_section
+from jaxsid.report.residuals import residual_section
 from jaxsid.report.units import units_of
 
 
@@ -35,8 +37,10 @@ def report_sections(found: Identification) -> tuple[Section, ...]:
     return (
         key_findings(found),
         matrices,
+        parameters_section(found),
         fit_section(found),
         time_section(found),
+        residual_section(found),
         frequency_section(found),
         shapes_section(found),
         order_section(found),

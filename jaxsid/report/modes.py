@@ -122,6 +122,20 @@ def worst_fits(found: Identification, most: int = 20) -> list[int]:
     return sorted(int(i) for i in worst)
 
 
+def compared(found: Identification) -> list[tuple[str, np.ndarray]]:
+    """Names and misfits of the models there are; the last is the one that is reported."""
+    given = (
+        ("Nominal model", found.nominal_nrmse),
+        ("CBSI alone", found.cbsi_nrmse),
+        ("Refined matrices", found.matrices_nrmse),
+    )
+    models = [(name, np.asarray(values)) for name, values in given if values is not None]
+    last = np.asarray(found.train_nrmse)
+    if found.matrices_nrmse is None or not np.array_equal(last, models[-1][1], equal_nan=True):
+        models.append(("State-space model", last))
+    return models
+
+
 def connecting(found: Identification, which: str, between: tuple[str, str]) -> tuple[float, float]:
     """Stiffness or damping between two bodies, or a body and ground, as the matrix has it; its deviation.
 

@@ -3,6 +3,7 @@
 import math
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+BEYOND = 100.0  # misfit that says no more than that a model moves by itself
 MISSING = "\N{EN DASH}"
 TIMES = " \N{MULTIPLICATION SIGN} "
 
@@ -60,6 +61,11 @@ def change(value: float, reference: float) -> str:
 def percent(share: float) -> str:
     """A share in percent, three significant digits."""
     return f"{significant(100 * share, 3)}\N{NO-BREAK SPACE}%" if math.isfinite(share) else MISSING
+
+
+def misfit(nrmse: float) -> str:
+    """A misfit in percent; a motion that grows beyond all measure has no useful number."""
+    return f"over {percent(BEYOND)}" if nrmse > BEYOND else percent(nrmse)
 
 
 def plural(count: int, noun: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxsid.files.results_json import SCHEMA, plain
 from jaxsid.identification import Identification
 from jaxsid.physical.elements import ElementValues
+from jaxsid.pipeline.misses import Peaks, cross_peaks, own_peaks
 from jaxsid.records import SecondOrderModel
 from jaxsid.report.modes import displacement_shapes, modes_of
 from jaxsid.report.units import sensor_kinds
@@ -33,7 +34,15 @@ def identification_json(found: Identification) -> dict[str, Any]:
         "fit": {
             "train_nrmse": _by_name(found.outputs, found.train_nrmse),
             "noise_floor": _by_name(found.outputs, found.noise_floor),
+            "nominal_nrmse": _by_name(found.outputs, found.nominal_nrmse),
+            "cbsi_nrmse": None if found.cbsi_nrmse is None else _by_name(found.outputs, found.cbsi_nrmse),
+            "matrices_nrmse": None
+            if found.matrices_nrmse is None
+            else _by_name(found.outputs, found.matrices_nrmse),
         },
+        "refined": found.refined,
+        "correlation": _correlation(found),
+        "residuals": _residuals(found),
         "warnings": list(found.warnings),
         "bodies": list(found.nominal.bodies),
         "sensors": list(found.outputs),
@@ -83,6 +92,47 @@ def elements_json(elements: ElementValues) -> list[dict[str, Any]]:
         | {"value": float(value), "std": float(std), "nominal": float(nominal)}
         for x, value, std, nominal in zip(elements.listed, *columns, strict=True)
     ]
+
+
+def _correlation(found: Identification) -> dict[str, Any] | None:
+    """Of the errors of the elements, or of the largest entries of matrices that are not made of them."""
+    values = found.elements or found.entries
+    if values is None:
+        return None
+    return {"names": [x.name for x in values.listed], "values": np.asarray(values.correlation)}
+
+
+def _residuals(found: Identification) -> list[dict[str, Any]]:
+    """The strongest correlations of what is left of each record with itself and with each input."""
+    peaks = zip(
+        found.records, own_peaks(found.residuals), cross_peaks(found.residuals), strict=bool(found.residuals)
+    )
+    return [
+        {
+            "record": record.name,
+            "sensors": {
+                name: {
+                    "autocorrelation": _peak(own, row),
+                    "inputs": {given: _peak(cross, (row, j)) for j, given in enumerate(record.inputs)},
+                }
+                for row, name in enumerate(found.outputs)
+                if name in record.outputs
+            },
+        }
+        for record, own, cross in peaks
+    ]
+
+
+def _peak(peaks: Peaks, at: Any) -> dict[str, Any]:
+    """Value, lag and size in standard deviations of chance; whether chance explains it."""
+    score = float(peaks.score[at])
+    return {
+        "value": float(peaks.value[at]),
+        "lag_s": float(peaks.lag[at]),
+        "score": score,
+        "limit": peaks.limit,
+        "by_chance": score <= peaks.limit if np.isfinite(score) else None,
+    }
 
 
 def _by_name(names: tuple[str, ...], values: Any) -> dict[str, float]:

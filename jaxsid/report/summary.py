@@ -8,8 +8,8 @@ from rich.table import Table
 
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
-from jaxsid.report.modes import modes_of, worst_fits
-from jaxsid.report.numbers import MISSING, change, percent, significant, with_std
+from jaxsid.report.modes import compared, modes_of, worst_fits
+from jaxsid.report.numbers import MISSING, change, misfit, percent, significant, with_std
 from jaxsid.report.results import MATRICES
 from jaxsid.report.units import units_of
 
@@ -72,8 +72,11 @@ def _entry(value: float, std: float | None, nominal: float) -> str:
 
 
 def _fit(found: Identification) -> Table:
-    table = _table("Fit", "sensor", "NRMSE", "noise floor")
+    models = compared(found)
+    table = _table(
+        "Fit (NRMSE)", "sensor", *(name.lower().replace("cbsi", "CBSI") for name, _ in models), "noise floor"
+    )
     for i in worst_fits(found):
         floor = percent(float(found.noise_floor[i]))
-        table.add_row(escape(found.outputs[i]), percent(float(found.train_nrmse[i])), floor)
+        table.add_row(escape(found.outputs[i]), *(misfit(float(values[i])) for _, values in models), floor)
     return table
