@@ -170,6 +170,20 @@ def simulate(
 
 
 @app.command()
+def effects(
+    kind: Annotated[str | None, typer.Argument(help="One kind in full; default: all, a line each.")] = None,
+) -> None:
+    """The kinds of effects beyond the linear model: friction, backlash, delays and others, for [[effects]]."""
+    with _errors():
+        from jaxsid.report.effects import print_effect, print_effects
+
+        if kind is None:
+            print_effects()
+        else:
+            print_effect(kind)
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the records, the model and the report.")] = Path(
         "demo"

@@ -343,3 +343,27 @@ def test_a_real_process_ends_with_the_exit_code(files, columns):
     assert "'force'" in done.stderr
     assert "Traceback" not in done.stderr
     assert not out.exists()
+
+
+def test_effects_are_listed_and_told_one_by_one(tmp_path):
+    from jaxsid.mechanics.effects.catalogue import CATALOGUE
+
+    listed = call("effects")
+    assert listed.exit_code == 0
+    for kind in CATALOGUE:
+        one = call("effects", kind)
+        assert one.exit_code == 0
+        assert CATALOGUE[kind].source.split(",")[0] in one.output
+    # what it says for the model file is one that can be read
+    text = call("effects", "coulomb_friction").output
+    lines = text[text.index("[[effects]]") :].replace('"body"', '"b1"')
+    model = tmp_path / "model.toml"
+    model.write_text(
+        'name = "one"\n[bodies]\nb1 = 1.0\n[[inputs]]\nname = "f"\nbody = "b1"\n'
+        '[[sensors]]\nname = "s"\nbody = "b1"\nkind = "velocity"\n' + lines
+    )
+    (effect,) = read_model(model).effects
+    assert effect.kind == "coulomb_friction"
+    unknown = call("effects", "backlsh")
+    assert unknown.exit_code == 2
+    assert "did you mean 'backlash'" in unknown.output

@@ -31,6 +31,23 @@ def kind_number(name: str) -> int:
     return list(CATALOGUE).index(name)
 
 
+def kind_named(name: str, said: str) -> Kind:
+    """The kind of effect of this name.
+
+    Args:
+        name: of the kind.
+        said: how to name the effect in a message.
+
+    Raises:
+        InputError: no such kind.
+    """
+    if name not in CATALOGUE:
+        near = difflib.get_close_matches(name, CATALOGUE, 1)
+        hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(CATALOGUE)}."
+        bad_input(f"{said}: this kind of effect is unknown; {hint}")
+    return CATALOGUE[name]
+
+
 def check_effect(name: str, where: str, parameters: Mapping[str, ArrayLike], said: str) -> None:
     """Raise InputError where an effect's kind, place or parameters cannot be.
 
@@ -40,11 +57,7 @@ def check_effect(name: str, where: str, parameters: Mapping[str, ArrayLike], sai
         parameters: given values by name, one number or one a record.
         said: how to name the effect in a message.
     """
-    if name not in CATALOGUE:
-        near = difflib.get_close_matches(name, CATALOGUE, 1)
-        hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(CATALOGUE)}."
-        bad_input(f"{said}: this kind of effect is unknown; {hint}")
-    kind = CATALOGUE[name]
+    kind = kind_named(name, said)
     require(where == kind.where, f"{said}: its place is '{kind.where}', not '{where}'.")
     names = [p.name for p in kind.parameters]
     for given in parameters:

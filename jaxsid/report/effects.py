@@ -1,0 +1,77 @@
+"""The catalogue of effects for a terminal: all kinds, or one with its parameters and how a model file gives it."""
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, kind_named
+from jaxsid.mechanics.effects.kind import Kind, Parameter
+
+PLACES = {
+    "between": 'between = ["ground", "body"]',
+    "body": 'body = "body"',
+    "sensor": 'sensor = "sensor"',
+    "input": 'input = "input"',
+}
+
+
+def print_effects(console: Console | None = None) -> None:
+    """All kinds: where they act, their law, their parameters.
+
+    Args:
+        console: where to; standard output where None.
+    """
+    table = Table(title="Effects beyond the linear model", title_justify="left", show_lines=False)
+    for name in ("kind", "place", "law", "parameters"):
+        table.add_column(name, overflow="fold")
+    for kind in CATALOGUE.values():
+        names = ", ".join(_told(p) for p in kind.parameters)
+        table.add_row(kind.name, kind.where, escape(kind.law), escape(names))
+    (console or Console()).print(table)
+
+
+def print_effect(name: str, console: Console | None = None) -> None:
+    """One kind in full.
+
+    Args:
+        name: of the kind.
+        console: where to; standard output where None.
+
+    Raises:
+        InputError: no such kind.
+    """
+    kind, out = kind_named(name, f"effect '{name}'"), console or Console()
+    out.print(f"[bold]{kind.name}[/bold]: {escape(kind.law)}", highlight=False)
+    out.print(escape(kind.about), highlight=False)
+    table = Table()
+    for column in ("parameter", "unit (moving, turning)", "least", "default"):
+        table.add_column(column)
+    for p in kind.parameters:
+        lowest = "" if p.lowest == -float("inf") else f"{p.lowest:g}"
+        table.add_row(
+            p.name, escape(_units(p)), lowest, "required" if p.default is None else f"{p.default:g}"
+        )
+    out.print(table)
+    out.print(f"Source: {escape(kind.source)}", highlight=False)
+    out.print("In a model file:\n", highlight=False)
+    out.print(escape(model_lines(kind)), highlight=False, soft_wrap=True)
+
+
+def model_lines(kind: Kind) -> str:
+    """How a model file gives an effect of this kind, with placeholders for names and numbers.
+
+    Args:
+        kind: one of the catalogue.
+    """
+    given = [p for p in kind.parameters if p.default is None] or list(kind.parameters[:1])
+    lines = ["[[effects]]", f'kind = "{kind.name}"', PLACES[kind.where]]
+    return "\n".join([*lines, *(f"{p.name} = {float(p.typical)}" for p in given)])
+
+
+def _told(parameter: Parameter) -> str:
+    unit = parameter.unit[0]
+    return f"{parameter.name} ({unit})" if unit else parameter.name
+
+
+def _units(parameter: Parameter) -> str:
+    return ", ".join(dict.fromkeys(x for x in parameter.unit if x)) or "none"
