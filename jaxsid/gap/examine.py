@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from jaxsid.checks import check_record, require
+from jaxsid.checks import require
 from jaxsid.gap.locate import Locations, locate
 from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
@@ -91,8 +91,6 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(len(records) > 0, "give at least one record.")
-    for record in records:
-        check_record(record)
     guessed = noise_of(model, records)
     freely = recalibrated(model, records, guessed, wide=True)
     within = recalibrated(model, records, freely.noises, wide=False, given=True)

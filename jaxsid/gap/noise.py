@@ -141,8 +141,7 @@ def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
     count = len(record.u) // period
     y = np.asarray(record.y)[-count * period :].reshape(count, period, -1)
     apart = np.diff(y, axis=0) / np.sqrt(2)
-    left = [_cleared(spectra_of(model, _without_input(record, x))) for x in apart]
-    signals = np.stack([x for x, _ in left])
+    signals = np.stack([_cleared(spectra_of(model, _without_input(record, x))) for x in apart])
     # free responses that the model's do not match die out from period to period
     level = np.sqrt(np.nanmean(signals**2, axis=1))
     used = (level <= SAME_PERIOD * np.nanmin(level, axis=0)) | np.isnan(level)
@@ -150,11 +149,11 @@ def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
 
 
 def _of_signals(model: LumpedModel, record: Record, source: str) -> Noise:
-    return _fitted(_cleared(spectra_of(model, record))[0][None], source)
+    return _fitted(_cleared(spectra_of(model, record))[None], source)
 
 
-def _cleared(spectra: Spectra) -> tuple[np.ndarray, np.ndarray]:
-    """What the model and its free responses leave, in time and in lines; NaN for absent sensors."""
+def _cleared(spectra: Spectra) -> Float[np.ndarray, "samples outputs"]:
+    """What the model and its free responses leave; NaN for absent sensors."""
     present, used = np.asarray(spectra.present) > 0, np.asarray(spectra.weight) > 0
     left = np.asarray(spectra.y - spectra.response)
     free = np.asarray(spectra.free)
@@ -168,7 +167,7 @@ def _cleared(spectra: Spectra) -> tuple[np.ndarray, np.ndarray]:
     state = np.linalg.lstsq(stack(columns), stack(target), rcond=1e-9)[0] / np.where(norm > 0, norm, 1.0)
     left = np.where(used[:, None], left - free @ state, 0.0)
     signal = np.fft.irfft(left * np.sqrt(spectra.samples), spectra.samples, axis=0)
-    return np.where(present, signal, np.nan), np.where(present, left, np.nan)
+    return np.where(present, signal, np.nan)
 
 
 def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str) -> Noise:
@@ -201,11 +200,13 @@ def floor(spectra: Spectra) -> Noise:
     Args:
         spectra: of the record.
     """
-    _, left = _cleared(spectra)
-    parts = np.array_split(np.abs(left[np.asarray(spectra.weight) == 1]) ** 2, BANDS)
+    # a window keeps what the effect leaves at its own frequencies out of the others
+    signal, window = _cleared(spectra), np.hanning(spectra.samples)[:, None]
+    power = np.abs(np.fft.rfft(signal * window, axis=0)) ** 2 / (window**2).sum()
+    parts = np.array_split(power[2:-1], BANDS)
     # the least of so many averages lies about two of their deviations low
     level = [x.mean(axis=0) / max(1 - 2 / np.sqrt(max(len(x), 1)), 0.3) for x in parts if len(x)]
-    taps = np.zeros((left.shape[1], MOST + 1))
+    taps = np.zeros((signal.shape[1], MOST + 1))
     taps[:, 0] = 1.0
     return Noise(np.sqrt(np.min(level, axis=0)), taps, 0.0, SOURCES[3])
 

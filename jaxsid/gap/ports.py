@@ -46,11 +46,11 @@ class Guess(eqx.Module):
 
     Attributes:
         motion: of the bodies, a row for each place.
-        size: extents of the place's signals over all records.
+        size: extents of the place's signals over all records; None where its shapes play no part yet.
     """
 
     motion: Motion
-    size: Extent
+    size: Extent | None
 
 
 class Explained(eqx.Module):
@@ -98,13 +98,16 @@ def _transfers(spectra: Spectra, port: Ports) -> tuple[Array, Array]:
     return plain, jnp.where(port.kind == 2, spectra.driven @ port.drive, plain)
 
 
-def _columns(given: Setting, port: Ports, motion: Motion, size: Extent) -> Array:
-    """(lines, outputs, e + k): elements, then shapes of the place."""
+def _columns(given: Setting, port: Ports, motion: Motion, size: Extent | None) -> Array:
+    """(lines, outputs, e + k): elements, then shapes of the place, none without its extents."""
     spectra = given.spectra
+    elements = parameter_columns(spectra, motion, given.directions)
+    if size is None:
+        return elements
     pair = signals(port.kind, spectra, motion, port.joint, port.sensor, port.drive)
     held = _transfers(spectra, port)[1]
     shaped = held[:, :, None] * shapes(port.kind, spectra, pair, size, given.rate)[:, None, :]
-    return jnp.concatenate([parameter_columns(spectra, motion, given.directions), shaped], axis=2)
+    return jnp.concatenate([elements, shaped], axis=2)
 
 
 @compiled
@@ -166,9 +169,12 @@ def _explained(given: Setting, port: Ports, guess: Guess, chosen: Chosen) -> Exp
     along, beside, square = split((rest * given.scale)[:, :, None], plain * given.scale)
     root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     process = variance * root / (1 + variance * square) * along[:, 0] * (square > 0)
-    pair = signals(port.kind, spectra, guess.motion, port.joint, port.sensor, port.drive)
-    shaped = shapes(port.kind, spectra, pair, guess.size, given.rate) @ chosen.coefficients[elements:]
-    force = shaped + process
+    force = process
+    if guess.size is not None:
+        pair = signals(port.kind, spectra, guess.motion, port.joint, port.sensor, port.drive)
+        force = (
+            force + shapes(port.kind, spectra, pair, guess.size, given.rate) @ chosen.coefficients[elements:]
+        )
     pushed = parameter_forces(guess.motion, given.directions) @ chosen.coefficients[:elements]
     motion = motion_under(spectra, pushed + force[:, None] * port.joint, transient)
     equations = jnp.maximum((given.scale > 0).sum() - len(square), 1)

@@ -71,8 +71,7 @@ def scores(
     ports, count = ports_of(model, places), len(places)
     motions = [_spread(_nominal_motion(s), count) for s in settings]
     scale = np.max([_force_scale(s, ports) for s in settings], axis=0)
-    alone = np.zeros((count, 1, len(tolerance) + MOST))
-    alone[:, :, : len(tolerance)] = tolerance
+    alone = np.tile(tolerance, (count, 1, 1))
     first = _round(settings, ports, motions, _grid(scale, SIZES, settings[0].rate), alone)
     latest = first
     for _ in range(ROUNDS):
@@ -97,8 +96,10 @@ def _spread(motion: Motion, count: int) -> Motion:
 def _round(
     settings: Sequence[Setting], ports: Ports, motions: list[Motion], force: Force, priors: np.ndarray
 ) -> _Round:
-    """All hypotheses of every place on given motions, and the best one of each."""
-    size = together([extents(s, ports, m) for s, m in zip(settings, motions, strict=True)])
+    """All hypotheses of every place on given motions, and the best one of each; with one variant, without shapes."""
+    size = None
+    if priors.shape[1] > 1:
+        size = together([extents(s, ports, m) for s, m in zip(settings, motions, strict=True)])
     guesses = [Guess(m, size) for m in motions]
     parts = [tables(s, ports, g, force) for s, g in zip(settings, guesses, strict=True)]
     found = evidence(jax.tree.map(lambda *x: sum(x[1:], start=x[0]), *parts), priors)

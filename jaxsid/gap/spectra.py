@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxsid.checks import require, require_finite
 from jaxsid.compilation import compiled
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
@@ -22,6 +23,7 @@ from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.simulate import measured_sensors, ordered_inputs
 from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderModel
 
+FEWEST = 64  # samples of a record
 CLEAR = 1e-9  # distance of a line from a pole, on the circle of z, from which on it is used
 
 
@@ -76,17 +78,39 @@ def spectra_of(model: LumpedModel, record: Record) -> Spectra:
         record: with some of its sensors.
 
     Raises:
-        InputError: an input or all sensors are missing, holds contradict.
+        InputError: an input or all sensors are missing, holds contradict, values are NaN, too few samples.
     """
     u, hold = ordered_inputs(model, record)
     rows, measured = measured_sensors(model, record)
     values = np.asarray(record.y)[:, measured]
+    _check(record, values)
     present = np.zeros(len(model.sensors))
     present[rows] = np.isfinite(values).all(axis=0)
     y = np.zeros((len(values), len(model.sensors)))
     y[:, rows] = np.where(np.isfinite(values).all(axis=0), values, 0.0)
     given = jnp.asarray(u), jnp.asarray(y), jnp.asarray(present)
     return _spectra(*given, _sampled_model(model, record.dt, hold))
+
+
+def _check(record: Record, values: np.ndarray) -> None:
+    require(
+        len(record.u) == len(record.y),
+        f"{record.name}: u has {len(record.u)} samples, y {len(record.y)}; read them at the same instants.",
+    )
+    require(float(record.dt) > 0, f"{record.name}: the sampling interval must be positive.")
+    require(
+        len(record.u) >= FEWEST,
+        f"{record.name}: {len(record.u)} samples tell too little; at least {FEWEST} are needed.",
+    )
+    require_finite(record.u, f"{record.name}, input", record.inputs)
+    missing = ~np.isfinite(values)
+    torn = [record.outputs[j] for j in np.flatnonzero(missing.any(axis=0) & ~missing.all(axis=0))]
+    require(
+        not torn,
+        f"{record.name}: sensor '{torn[0] if torn else ''}' has values that are NaN or infinite. Cut the record, or "
+        "leave the column out.",
+    )
+    require(not missing.all(), f"{record.name}: none of the model's sensors holds values.")
 
 
 class _Sampled(NamedTuple):
