@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model, second_order
 from jaxsid.records import Record
 
-DT, SAMPLES = 0.01, 1536
+DT, SAMPLES = 0.01, 1024
 BODIES = ("b1", "b2", "b3")
 MASS, STIFFNESS, DAMPING = [1.0, 1.2, 0.8], [2000.0, 1500.0, 1000.0], [4.0, 3.0, 2.5]
 SENSED = ((0, "acceleration"), (1, "acceleration"), (2, "acceleration"))

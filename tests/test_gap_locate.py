@@ -9,11 +9,11 @@ from jaxsid.gap.locate import locate
 from jaxsid.gap.places import Place, joint_of, places_of
 from jaxsid.mechanics.lumped import Connection, Matrices, lumped_model, second_order
 
-FRICTION = ("coulomb_friction", JOINT, {"force": 2.5})
+CUBIC = ("cubic_stiffness", JOINT, {"coefficient": 3e6})
 B12, B1 = Place("between", ("b1", "b2")), Place("between", ("ground", "b1"))
 CASES = [
-    (*FRICTION, B12),
-    ("cubic_stiffness", JOINT, {"coefficient": 3e6}, B12),
+    ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.0}, B12),
+    (*CUBIC, B12),
     ("backlash", (1, 2), {"half_gap": 0.003}, Place("between", ("b2", "b3"))),
     ("quadratic_damping", WALL, {"coefficient": 15.0}, B1),
     ("sensor_delay", 1, {"delay": 0.004}, Place("sensor", ("s1",))),
@@ -36,7 +36,7 @@ def test_place_is_found_with_all_sensors(kind, place, parameters, expected):
 
 
 def test_place_is_found_with_one_sensor():
-    u, y = measured(*FRICTION)
+    u, y = measured(*CUBIC)
     kinds = SENSED[2:]
     found = locate(chain(kinds), record(u, y[:, 2:], kinds))
     assert B12 in found.likely
@@ -54,7 +54,7 @@ def test_delays_of_one_sensor_and_of_the_input_are_one_set():
 
 def test_force_is_that_of_the_law():
     """Cubic stiffness: the force on the second end is -p d^3."""
-    u, y = measured("cubic_stiffness", JOINT, {"coefficient": 3e6})
+    u, y = measured(*CUBIC)
     found = locate(chain(), record(u, y)).maps[0]
     inner = slice(100, -100)
     expected = -3e6 * found.displacement**3
@@ -66,7 +66,7 @@ def test_force_is_that_of_the_law():
 def test_records_that_each_hold_some_sensors():
     parts = []
     for seed, sensors in ((0, (0, 2)), (1, (1,))):
-        u, y = measured(*FRICTION, seed=seed)
+        u, y = measured(*CUBIC, seed=seed)
         kinds = tuple(SENSED[i] for i in sensors)
         parts.append(record(u, y[:, list(sensors)], kinds))
     found = locate(chain(), parts)
@@ -76,7 +76,7 @@ def test_records_that_each_hold_some_sensors():
 
 def test_units_do_not_matter():
     """Grams instead of kilograms: the same probabilities."""
-    u, y = measured(*FRICTION)
+    u, y = measured(*CUBIC)
     plain = chain()
     small = lumped_model(
         plain.bodies,

@@ -98,7 +98,8 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
     null, near = null_test(freely, places), null_test(within, places)
     drawn = tolerance_test(within, freely)
     structural = null.p_value < SIGNIFICANT and null.share > NEGLIGIBLE
-    nominal = min(1.0, 2 * min(drawn, near.p_value))
+    # what is of no matter is no reason to doubt the model, however surely it is there
+    nominal = min(1.0, 2 * min(drawn, near.p_value if near.share > NEGLIGIBLE else 1.0))
     off = structural or nominal < SIGNIFICANT
     # what an unmodelled law leaves is no noise
     noises = guessed if structural else freely.noises

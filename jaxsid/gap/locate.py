@@ -127,7 +127,7 @@ def _concluded(
         Location(places[i], float(probability[i]), float(value[i] - value.max()), float(across[i]))
         for i in order
     )
-    likely = [i for i in order if probability[i] >= LIKELY * probability.max()]
+    likely = [int(i) for i in order if probability[i] >= LIKELY * probability.max()]
     maps = tuple(
         force_map(model, places[i], setting, made, i, found.process_force, noise, number)
         for i in likely[:MOST_MAPS]

@@ -113,7 +113,7 @@ def is_free_or_unstable(model: LumpedModel) -> bool:
         model: its linear part.
     """
     poles = np.linalg.eigvals(np.asarray(physical_displacement_velocity(second_order(model)).A))
-    return bool((poles.real > -1e-7 * np.abs(poles).max()).any())
+    return bool((poles.real >= -1e-7 * np.abs(poles).max()).any())
 
 
 def _white(fit: Recalibrated, number: int) -> np.ndarray:

@@ -8,6 +8,7 @@ says whether they explain more of what is left than chance does.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +17,11 @@ from jax.scipy.special import betainc, gammaincc
 from jaxsid.gap.evidence import Force
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
-from jaxsid.gap.recalibrate import Recalibrated
+from jaxsid.gap.recalibrate import Linear, Recalibrated
 from jaxsid.gap.scoring import together
+from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion
+from jaxsid.impulse.lines import NEIGHBOURS, line_level
 
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
@@ -89,7 +92,8 @@ def _laws(fit: Recalibrated, places: tuple[Place, ...]) -> list[Test]:
     sizes = [extents(s, ports, m) for s, m in zip(fit.settings, motions, strict=True)]
     size = together(sizes)
     none = Force(jnp.zeros((count, 1)), jnp.ones((count, 1)))
-    parts = [tables(s, ports, Guess(m, size), none) for s, m in zip(fit.settings, motions, strict=True)]
+    settings = [_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True)]
+    parts = [tables(s, ports, Guess(m, size), none) for s, m in zip(settings, motions, strict=True)]
     gram = np.sum([np.asarray(x.gram)[:, 0] for x in parts], axis=0)
     elements = len(fit.change)
     nuisances = elements + sum(len(s.transient) for s in fit.settings)
@@ -119,6 +123,13 @@ def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit
     return Test(name, p, np.sqrt(excess) * _left_share(fit))
 
 
+def _leveled(setting: Setting, linear: Linear) -> Setting:
+    """The setting with the noise's level taken from what is left around each line, whatever a filter makes of it."""
+    white = linear.left * setting.scale
+    level = line_level(white, (setting.scale > 0) * 1.0)
+    return eqx.tree_at(lambda s: s.scale, setting, setting.scale / level)
+
+
 def _left_share(fit: Recalibrated) -> float:
     """Rms of what is left next to that of the response, the mean over all sensors."""
     left = sum((np.abs(np.asarray(x.left)) ** 2).sum(axis=0) for x in fit.linear)
@@ -128,19 +139,20 @@ def _left_share(fit: Recalibrated) -> float:
 
 
 def _lone_line(fit: Recalibrated) -> Test:
-    """Whether one frequency holds more than chance gives to any."""
-    power = [
-        np.abs(np.asarray(x.left) * np.asarray(s.scale)) ** 2
-        for s, x in zip(fit.settings, fit.linear, strict=True)
-    ]
-    used = [
-        p[(np.asarray(s.spectra.weight) == 1)][:, np.asarray(s.spectra.present) > 0]
-        for s, p in zip(fit.settings, power, strict=True)
-    ]
-    every = np.concatenate([x.ravel() for x in used])
-    top = every.max() / every.mean()
-    p = float(-np.expm1(every.size * np.log1p(-np.exp(-top))))
-    return Test("lone frequency", p, np.sqrt(every.max() / every.sum()) * _left_share(fit))
+    """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees."""
+    around, every = np.ones(2 * NEIGHBOURS + 1), []
+    around[NEIGHBOURS] = 0.0
+    for setting, linear in zip(fit.settings, fit.linear, strict=True):
+        used = np.asarray(setting.spectra.weight) == 1
+        power = np.abs(np.asarray(linear.left) * np.asarray(setting.scale))[used] ** 2
+        power = power[:, np.asarray(setting.spectra.present) > 0]
+        smooth = lambda x: np.stack([np.convolve(c, around, mode="same") for c in x.T], axis=1)  # noqa: E731
+        every.append(np.stack([power, smooth(power), smooth(np.ones_like(power))]).reshape(3, -1))
+    power, others, count = np.concatenate(every, axis=1)
+    alone = (1 + power / np.maximum(others, np.finfo(float).tiny)) ** -count
+    p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
+    share = np.sqrt(power[alone.argmin()] / power.sum()) * _left_share(fit)
+    return Test("lone frequency", p, float(share))
 
 
 def _power(fit: Recalibrated) -> Test:

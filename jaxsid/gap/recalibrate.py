@@ -82,11 +82,14 @@ def recalibrated(
     """
     elements = element_matrices(model)
     nominal = np.asarray(elements.nominal)
-    prior = np.array(
-        [WIDE[x.quantity] if wide else getattr(model.tolerance, x.quantity) for x in elements.listed]
+    near, far = (
+        np.where(nominal != 0, np.maximum([of[x.quantity] for x in elements.listed], FIXED), FIXED)
+        for of in (model.tolerance._asdict(), WIDE)
     )
-    prior = np.where(nominal != 0, np.maximum(prior, FIXED), FIXED)
-    change, noises = np.zeros(len(nominal)), tuple(noises)
+    prior, noises = far if wide else near, tuple(noises)
+    change = np.zeros(len(nominal))
+    if wide:  # by way of the best values within the tolerance: from far off, others may be taken for them
+        change = _fit(model, records, noises, change, near).change
     guessed = [n.degrees == 0 and not given for n in noises]
     fit = _fit(model, records, noises, change, prior)
     for _ in range(ROUNDS if any(guessed) else 0):

@@ -70,10 +70,10 @@ def element_directions(model: LumpedModel) -> tuple[Array, Array, Array]:
 
 
 def slowest_rate(model: LumpedModel) -> float:
-    """Magnitude of a model's slowest pole that is not at zero, rad/s.
+    """Magnitude of a model's slowest pole that is not at zero, rad/s; 1 where all are.
 
     Args:
         model: its linear part.
     """
     poles = np.abs(np.linalg.eigvals(np.asarray(physical_displacement_velocity(second_order(model)).A)))
-    return float(poles[poles > 1e-6 * poles.max()].min())
+    return float(poles[poles > 1e-6 * poles.max()].min(initial=np.inf)) if poles.any() else 1.0
