@@ -54,12 +54,14 @@ def test_delays_of_one_sensor_and_of_the_input_are_one_set():
 
 def test_force_is_that_of_the_law():
     """Cubic stiffness: the force on the second end is -p d^3."""
-    u, y = measured(*CUBIC)
-    found = locate(chain(), record(u, y)).maps[0]
+    # accelerometers do not tell a steady force
+    kinds = tuple((body, "displacement") for body, _ in SENSED)
+    u, y = measured(*CUBIC, kinds)
+    found = locate(chain(kinds), record(u, y, kinds)).maps[0]
     inner = slice(100, -100)
     expected = -3e6 * found.displacement**3
     error = (found.force - expected)[inner]
-    assert np.sqrt((error**2).mean()) < 0.1 * expected.std()
+    assert np.sqrt((error**2).mean()) < 0.2 * expected.std()
     assert 0 < found.deviation < 0.3 * expected.std()
 
 
