@@ -1,0 +1,1 @@
+"""Where a model and the records part: noise, size of the gap, its place."""

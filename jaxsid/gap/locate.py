@@ -1,0 +1,174 @@
+"""At which place an unmodelled effect acts, how surely, and the force that it exerts there."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsid.checks import require
+from jaxsid.gap.force_map import ForceMap, force_map
+from jaxsid.gap.noise import Noise, deviations, noise_of
+from jaxsid.gap.places import Place, places_of
+from jaxsid.gap.scoring import Scores, scores
+from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
+from jaxsid.gap.spectra import spectra_of
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.elements import element_matrices
+from jaxsid.records import Record
+
+# Raw evidence is overconfident, for what no basis of shapes holds decides, not noise: it is divided by this.
+TEMPERATURE = 100.0
+LIKELY = 0.05  # of the probability of the first: what is not told apart from it
+MOST_MAPS = 3  # places of which the force is reported
+UNEXPLAINED = (
+    2.0  # mean square, in noise, across a place's transfer, from which on no force there explains the records
+)
+
+
+class Location(NamedTuple):
+    """One place.
+
+    Attributes:
+        place: where.
+        probability: of all places.
+        evidence: its logarithm, less that of the first.
+        across: mean square, in noise, of what no force at this place could explain; about 1 at the right one, NaN
+            where one sensor leaves nothing to judge by.
+    """
+
+    place: Place
+    probability: float
+    evidence: float
+    across: float
+
+
+class Locations(NamedTuple):
+    """Where an unmodelled effect acts.
+
+    Attributes:
+        ranked: every place, most probable first.
+        likely: those that these records do not tell apart from the first, with it.
+        maps: the force over time at the most probable of them, one a record.
+        noises: of each record.
+        remarks: what is to be known about it.
+    """
+
+    ranked: tuple[Location, ...]
+    likely: tuple[Place, ...]
+    maps: tuple[ForceMap, ...]
+    noises: tuple[Noise, ...]
+    remarks: tuple[str, ...]
+
+
+def locate(
+    model: LumpedModel,
+    records: Record | Sequence[Record],
+    *,
+    noises: Sequence[Noise] | None = None,
+    places: Sequence[Place] | None = None,
+) -> Locations:
+    """The places where one force, or one error of a signal, explains what a model leaves of records.
+
+    For place l the lines of what is left are r = sum_i c_i b_i + g_l f + noise: f a law of the motion there on a
+    basis of shapes and a Matern-3/2 process for what that leaves, the c_i errors of the linear parameters within the
+    model's tolerance and initial states. Evidence is closed, and the probability of l proportional to
+    exp(evidence / T).
+
+    Args:
+        model: nominal; its effects are left out.
+        records: one or several, each with some of the model's sensors.
+        noises: one a record; None finds them.
+        places: which to compare; None for all pairs of ends, sensors and inputs.
+
+    Returns:
+        Locations.
+
+    Raises:
+        InputError: inputs or sensors are missing, or names contradict.
+
+    Source: M. Alvarez, D. Luengo, N. Lawrence, IEEE Trans. Pattern Analysis 35 (2013), for forces as processes.
+    """
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    require(len(records) > 0, "give at least one record.")
+    compared = places_of(model) if places is None else tuple(places)
+    require(len(compared) > 0, "give at least one place.")
+    noises = noise_of(model, records) if noises is None else tuple(noises)
+    require(len(noises) == len(records), f"{len(records)} records need as many noises, not {len(noises)}.")
+    elements = element_matrices(model)
+    directions = element_directions(model)
+    rate = slowest_rate(model)
+    settings = []
+    for record, noise in zip(records, noises, strict=True):
+        spectra = spectra_of(model, record)
+        settings.append(setting_of(spectra, deviations(noise, spectra), directions, rate))
+    # a sensor that no record has cannot be at fault
+    seen = np.any([np.asarray(s.spectra.present) > 0 for s in settings], axis=0)
+    names = [s.name for s, there in zip(model.sensors, seen, strict=True) if there]
+    compared = tuple(p for p in compared if p.where != "sensor" or p.ends[0] in names)
+    tolerance = np.array([getattr(model.tolerance, x.quantity) for x in elements.listed])
+    found = scores(model, settings, compared, tolerance)
+    return _concluded(model, records, settings, noises, compared, found)
+
+
+def _concluded(
+    model: LumpedModel,
+    records: tuple[Record, ...],
+    settings: list[Setting],
+    noises: tuple[Noise, ...],
+    places: tuple[Place, ...],
+    found: Scores,
+) -> Locations:
+    value = _with_ties(found, places)
+    probability = np.exp((value - value.max()) / TEMPERATURE)
+    probability = probability / probability.sum()
+    across = _across(settings, found)
+    order = np.argsort(-value, kind="stable")
+    ranked = tuple(
+        Location(places[i], float(probability[i]), float(value[i] - value.max()), float(across[i]))
+        for i in order
+    )
+    likely = [int(i) for i in order if probability[i] >= LIKELY * probability.max()]
+    maps = tuple(
+        force_map(model, places[i], setting, made, i, found.process_force, noise, number)
+        for i in likely[:MOST_MAPS]
+        for number, (setting, made, noise) in enumerate(zip(settings, found.explained, noises, strict=True))
+    )
+    return Locations(ranked, tuple(places[i] for i in likely), maps, noises, _remarks(across, likely, places))
+
+
+def _with_ties(found: Scores, places: tuple[Place, ...]) -> np.ndarray:
+    """Evidence, where one input and one sensor share it if delays and lags explain the records.
+
+    Between one input and one sensor these commute with the model: at either end they do the same.
+    """
+    value = found.best.copy()
+    signals = [i for i, p in enumerate(places) if p.where != "between"]
+    if sorted(places[i].where for i in signals) == ["input", "sensor"]:
+        value[signals] = np.maximum(value[signals], found.linear[signals].max())
+    return value
+
+
+def _across(settings: Sequence[Setting], found: Scores) -> np.ndarray:
+    """Mean over the records that have two sensors or more."""
+    told = [float(np.asarray(s.spectra.present).sum()) > 1 for s in settings]
+    values = [np.asarray(x.across) for x, t in zip(found.explained, told, strict=True) if t]
+    return np.mean(values, axis=0) if values else np.full(len(found.process), np.nan)
+
+
+def _remarks(across: np.ndarray, likely: Sequence[int], places: tuple[Place, ...]) -> tuple[str, ...]:
+    said = []
+    if np.isnan(across).all():
+        said.append(
+            "One sensor: a force at any place could explain what is left, so that only its shape tells where it acts. "
+            "A second sensor would tell more."
+        )
+    elif np.nanmin(across) > UNEXPLAINED:
+        said.append(
+            f"No force at a single place explains all of the gap: it leaves {np.sqrt(np.nanmin(across)):.3g} times the "
+            "noise. There may be several effects, or errors of the linear parameters beyond their tolerance."
+        )
+    if len(likely) > 1:
+        said.append(
+            f"These records do not tell apart: {', '.join(places[i].label for i in likely)}. Another sensor would."
+        )
+    return tuple(said)

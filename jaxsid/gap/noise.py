@@ -1,0 +1,216 @@
+"""Level and colour of each sensor's noise, from the best part of the records that tells of it.
+
+In this order: periods of a periodic record, records of equal inputs, a part without input, and else the quietest band
+of what a model leaves. Free responses of the model are taken out of all of them.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxsid.checks import require
+from jaxsid.gap.spectra import Spectra, spectra_of
+from jaxsid.impulse.whitening import MOST, whitening_filter
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.records import Record
+
+SAME_INPUT = 0.02  # rms of a difference between two inputs, next to theirs, that are one
+SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, that is still noise
+SHORTEST = 128  # samples of a period or a quiet part that tells of noise
+QUIET = 1e-4  # largest input of a quiet part, next to the largest
+BANDS = 24  # of which the quietest is taken for noise
+SOURCES = ("periods", "repeated records", "quiet part", "residual")
+
+
+class Noise(eqx.Module):
+    """Noise of each of a model's sensors in one record, sum_k taps_k e_(t-k) = level * white.
+
+    Attributes:
+        level: (outputs,) standard deviation of the white noise, in the sensors' units; NaN for absent sensors.
+        taps: (outputs, count) of the filter that makes it white, the first 1.
+        degrees: number of independent values that it was found from; 0 where it is a guess from a model's residual.
+        source: "periods", "repeated records", "quiet part" or "residual".
+    """
+
+    level: Float[np.ndarray, " outputs"]
+    taps: Float[np.ndarray, "outputs taps"]
+    degrees: float
+    source: str = eqx.field(static=True)
+
+    def deviation(self, omega: np.ndarray, dt: float) -> Float[np.ndarray, "lines outputs"]:
+        """Standard deviation of lines that are scaled by 1/sqrt(samples).
+
+        Args:
+            omega: (lines,) rad/s.
+            dt: sampling interval, s.
+        """
+        z = np.exp(-1j * np.outer(omega * dt, np.arange(self.taps.shape[1])))
+        level = np.where(np.isfinite(self.level), self.level, 1.0)
+        return level / np.abs(z @ self.taps.T)
+
+    def rms(self) -> Float[np.ndarray, " outputs"]:
+        """Standard deviation of the noise with its colour."""
+        omega = np.linspace(0.0, np.pi, 4097)
+        return np.sqrt((self.deviation(omega, 1.0) ** 2).mean(axis=0)) + 0 * self.level
+
+
+def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]:
+    """The noise of each record.
+
+    Args:
+        model: whose free responses are taken out; its sensors give the order.
+        records: with some of its sensors each.
+
+    Raises:
+        InputError: an input or all sensors of a record are missing.
+    """
+    require(len(records) > 0, "give at least one record.")
+    return tuple(_of_record(model, r, [x for x in records if x is not r]) for r in records)
+
+
+def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Noise:
+    period = period_of(np.asarray(record.u))
+    if period is not None:
+        return _of_periods(model, record, period)
+    again = [x for x in others if _same_input(record, x)]
+    if again:
+        pair = (record, again[0])
+        apart = (np.asarray(pair[0].y) - np.asarray(pair[1].y)) / np.sqrt(2)
+        return _of_signals(model, _without_input(record, apart), SOURCES[1])
+    quiet = quiet_part(np.asarray(record.u))
+    if quiet is not None:
+        return _of_signals(model, _without_input(record, np.asarray(record.y)[quiet]), SOURCES[2])
+    return floor(spectra_of(model, record))
+
+
+def period_of(u: Float[np.ndarray, "samples inputs"]) -> int | None:
+    """Samples after which the inputs repeat, at least twice in the record; None where they do not.
+
+    Args:
+        u: inputs.
+    """
+    samples = len(u)
+    if samples < 2 * SHORTEST:
+        return None
+    centred = u - u.mean(axis=0)
+    size = 1 << (2 * samples - 1).bit_length()
+    power = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2
+    same = np.fft.irfft(power, size, axis=0)[:samples].sum(axis=1)
+    energy = np.cumsum((centred**2).sum(axis=1))
+    lag = np.arange(SHORTEST, samples // 2 + 1)
+    both = energy[samples - 1 - lag] + energy[-1] - energy[lag - 1]
+    if energy[-1] <= 0:
+        return None
+    apart = np.sqrt(np.maximum(both - 2 * same[lag], 0.0) / np.maximum(both, np.finfo(float).tiny))
+    good = np.flatnonzero(apart < SAME_INPUT)
+    if not len(good):
+        return None
+    # around a period the difference grows again; a slow input differs little from itself at any short lag
+    end = good[0] + int(np.argmax(np.append(apart[good[0] :] >= SAME_INPUT, True)))
+    best = int(good[0] + np.argmin(apart[good[0] : end]))
+    return int(lag[best]) if apart[:best].max(initial=0.0) > 0.5 else None
+
+
+def _same_input(one: Record, other: Record) -> bool:
+    a, b = np.asarray(one.u), np.asarray(other.u)
+    alike = a.shape == b.shape and one.inputs == other.inputs and one.outputs == other.outputs
+    return alike and bool(np.sqrt(((a - b) ** 2).sum()) <= SAME_INPUT * np.sqrt((a**2).sum()))
+
+
+def quiet_part(u: Float[np.ndarray, "samples inputs"]) -> slice | None:
+    """Where the record begins without input, None where that is too short.
+
+    Args:
+        u: inputs.
+    """
+    loud = (np.abs(u) > QUIET * np.abs(u).max(axis=0)).any(axis=1)
+    first = int(np.argmax(loud)) if loud.any() else len(u)
+    return slice(0, first) if first >= SHORTEST else None
+
+
+def _without_input(record: Record, y: np.ndarray) -> Record:
+    u = np.zeros((len(y), len(record.inputs)))
+    return Record(
+        u, y, record.dt, inputs=record.inputs, outputs=record.outputs, hold=record.hold, name=record.name
+    )
+
+
+def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
+    count = len(record.u) // period
+    y = np.asarray(record.y)[-count * period :].reshape(count, period, -1)
+    apart = np.diff(y, axis=0) / np.sqrt(2)
+    signals = np.stack([_cleared(spectra_of(model, _without_input(record, x))) for x in apart])
+    # free responses that the model's do not match die out from period to period
+    level = np.sqrt(np.nanmean(signals**2, axis=1))
+    used = (level <= SAME_PERIOD * np.nanmin(level, axis=0)) | np.isnan(level)
+    return _fitted(signals[used.all(axis=1)] if used.all(axis=1).any() else signals[-1:], SOURCES[0])
+
+
+def _of_signals(model: LumpedModel, record: Record, source: str) -> Noise:
+    return _fitted(_cleared(spectra_of(model, record))[None], source)
+
+
+def _cleared(spectra: Spectra) -> Float[np.ndarray, "samples outputs"]:
+    """What the model and its free responses leave; NaN for absent sensors."""
+    present, used = np.asarray(spectra.present) > 0, np.asarray(spectra.weight) > 0
+    left = np.asarray(spectra.y - spectra.response)
+    free = np.asarray(spectra.free)
+    size = np.sqrt((np.abs(left[used]) ** 2).mean(axis=0))
+    scale = (present / np.where(size > 0, size, 1.0))[:, None]
+    columns = (free[used] * scale).reshape(-1, free.shape[2])
+    target = (left[used] * scale[:, 0]).ravel()
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(norm > 0, norm, 1.0)
+    stack = lambda x: np.concatenate([x.real, x.imag])  # noqa: E731
+    state = np.linalg.lstsq(stack(columns), stack(target), rcond=1e-9)[0] / np.where(norm > 0, norm, 1.0)
+    left = np.where(used[:, None], left - free @ state, 0.0)
+    signal = np.fft.irfft(left * np.sqrt(spectra.samples), spectra.samples, axis=0)
+    return np.where(present, signal, np.nan)
+
+
+def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str) -> Noise:
+    """Burg's filter of each sensor, and the level of what it leaves."""
+    outputs = signals.shape[2]
+    level, taps = np.full(outputs, np.nan), np.zeros((outputs, MOST + 1))
+    taps[:, 0] = 1.0
+    for j in range(outputs):
+        if not np.isfinite(signals[:, :, j]).all():
+            continue
+        taps[j] = whitening_filter(signals[:, :, j])
+        white = sum(c * np.roll(signals[:, :, j], k, axis=1) for k, c in enumerate(taps[j]))
+        level[j] = np.sqrt((np.asarray(white)[:, MOST:] ** 2).mean())
+    return Noise(level, taps, float(signals[:, :, 0].size), source)
+
+
+def residual_noise(signals: Float[np.ndarray, "samples outputs"]) -> Noise:
+    """Level and colour of what a model left, taken for noise as a whole.
+
+    Args:
+        signals: what it left; NaN for absent sensors.
+    """
+    noise = _fitted(signals[None], SOURCES[3])
+    return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
+
+
+def floor(spectra: Spectra) -> Noise:
+    """White noise of the level of the quietest band of what a model leaves.
+
+    Args:
+        spectra: of the record.
+    """
+    # a window keeps what the effect leaves at its own frequencies out of the others
+    signal, window = _cleared(spectra), np.hanning(spectra.samples)[:, None]
+    power = np.abs(np.fft.rfft(signal * window, axis=0)) ** 2 / (window**2).sum()
+    parts = np.array_split(power[2:-1], BANDS)
+    # the least of so many averages lies about two of their deviations low
+    level = [x.mean(axis=0) / max(1 - 2 / np.sqrt(max(len(x), 1)), 0.3) for x in parts if len(x)]
+    taps = np.zeros((signal.shape[1], MOST + 1))
+    taps[:, 0] = 1.0
+    return Noise(np.sqrt(np.min(level, axis=0)), taps, 0.0, SOURCES[3])
+
+
+def deviations(noise: Noise, spectra: Spectra) -> Float[np.ndarray, "lines outputs"]:
+    """Standard deviations of a record's lines; arguments as of `Noise.deviation`."""
+    return noise.deviation(np.asarray(spectra.omega), float(spectra.dt))

@@ -1,0 +1,166 @@
+"""Is what a linear model leaves of records noise? Tests for laws of the motion, lone frequencies and power.
+
+The shapes that an effect's force may have are evaluated on the refitted model's own motion, not on the measured one, so
+that noise does not find itself. Whatever the level of the noise, and any colour that is the same throughout, an F test
+says whether they explain more of what is left than chance does.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import betainc, gammaincc
+
+from jaxsid.gap.evidence import Force
+from jaxsid.gap.places import Place
+from jaxsid.gap.ports import Guess, extents, ports_of, tables
+from jaxsid.gap.recalibrate import Linear, Recalibrated
+from jaxsid.gap.scoring import together
+from jaxsid.gap.setting import Setting
+from jaxsid.gap.spectra import Motion
+from jaxsid.impulse.lines import NEIGHBOURS, line_level
+
+DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
+
+
+class Test(NamedTuple):
+    """One test.
+
+    Attributes:
+        name: what it looks for.
+        p_value: probability of as much by chance.
+        share: rms of what it found next to that of the response.
+    """
+
+    name: str
+    p_value: float
+    share: float
+
+
+class Null(NamedTuple):
+    """Whether records agree with a model within noise.
+
+    Attributes:
+        p_value: of all tests together, by Holm's rule.
+        share: rms of what the strongest test found, next to that of the response.
+        tests: each alone.
+    """
+
+    p_value: float
+    share: float
+    tests: tuple[Test, ...]
+
+
+def null_test(fit: Recalibrated, places: Sequence[Place]) -> Null:
+    """Whether a refitted model leaves noise alone.
+
+    Args:
+        fit: the model and what it leaves.
+        places: where effects are looked for.
+
+    Source: S. Holm, Scand. J. Statistics 6 (1979).
+    """
+    tests = [*_laws(fit, tuple(places)), _lone_line(fit)]
+    if all(n.degrees > 0 for n in fit.noises):
+        tests.append(_power(fit))
+    worst = min(tests, key=lambda t: t.p_value)
+    return Null(min(1.0, worst.p_value * len(tests)), worst.share, tuple(tests))
+
+
+def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
+    """Probability, by chance, of elements as far from their nominal values as the records ask for.
+
+    Twice the logarithm of the ratio of likelihoods follows a chi-squared law with a degree for each element.
+
+    Args:
+        within: refitted with the model's tolerance as prior.
+        freely: refitted without, to the same noise.
+    """
+    drawn = float(((within.change / within.prior) ** 2).sum())
+    ratio = max(within.squares + drawn - freely.squares, 0.0)
+    return float(gammaincc(len(within.change) / 2, ratio / 2))
+
+
+def _laws(fit: Recalibrated, places: tuple[Place, ...]) -> list[Test]:
+    """An F test for the shapes of each place."""
+    ports, count = ports_of(fit.model, places), len(places)
+    spread = lambda m: jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), m)  # noqa: E731
+    motions: list[Motion] = [spread(x.motion) for x in fit.linear]
+    sizes = [extents(s, ports, m) for s, m in zip(fit.settings, motions, strict=True)]
+    size = together(sizes)
+    none = Force(jnp.zeros((count, 1)), jnp.ones((count, 1)))
+    settings = [_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True)]
+    parts = [tables(s, ports, Guess(m, size), none) for s, m in zip(settings, motions, strict=True)]
+    gram = np.sum([np.asarray(x.gram)[:, 0] for x in parts], axis=0)
+    elements = len(fit.change)
+    nuisances = elements + sum(len(s.transient) for s in fit.settings)
+    return [
+        _shapes_test(f"law at {p.label}", g, elements, nuisances, fit)
+        for p, g in zip(places, gram, strict=True)
+    ]
+
+
+def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit: Recalibrated) -> Test:
+    """Of one place, elements out of the way first."""
+    norm = np.sqrt(np.diag(gram))
+    gram = gram / np.where(norm > 0, norm, 1.0) / np.where(norm > 0, norm, 1.0)[:, None]
+    e = elements
+    own = gram[:e, :e] + 1e-10 * np.eye(e)
+    gram = gram[e:, e:] - gram[e:, :e] @ np.linalg.solve(own, gram[:e, e:])
+    values, vectors = np.linalg.eigh(gram[:-1, :-1])
+    seen = values > DEPENDENT
+    explained = float(((vectors[:, seen].T @ gram[:-1, -1]) ** 2 / values[seen]).sum())
+    rank, total = int(seen.sum()), float(gram[-1, -1])
+    if rank == 0 or total <= 0:
+        return Test(name, 1.0, 0.0)
+    rest = max(fit.equations - nuisances - rank, 1)
+    ratio = (explained / rank) / (max(total - explained, 1e-300) / rest)
+    p = float(betainc(rest / 2, rank / 2, rest / (rest + rank * ratio)))
+    excess = max(explained - (total - explained) * rank / rest, 0.0) / total
+    return Test(name, p, np.sqrt(excess) * _left_share(fit))
+
+
+def _leveled(setting: Setting, linear: Linear) -> Setting:
+    """The setting with the noise's level taken from what is left around each line, whatever a filter makes of it."""
+    white = linear.left * setting.scale
+    level = line_level(white, (setting.scale > 0) * 1.0)
+    return eqx.tree_at(lambda s: s.scale, setting, setting.scale / level)
+
+
+def _left_share(fit: Recalibrated) -> float:
+    """Rms of what is left next to that of the response, the mean over all sensors."""
+    left = sum((np.abs(np.asarray(x.left)) ** 2).sum(axis=0) for x in fit.linear)
+    size = sum((np.abs(np.asarray(s.spectra.y)) ** 2).sum(axis=0) for s in fit.settings)
+    present = np.asarray(size) > 0
+    return float(np.sqrt((np.asarray(left)[present] / np.asarray(size)[present]).mean()))
+
+
+def _lone_line(fit: Recalibrated) -> Test:
+    """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees."""
+    around, every = np.ones(2 * NEIGHBOURS + 1), []
+    around[NEIGHBOURS] = 0.0
+    for setting, linear in zip(fit.settings, fit.linear, strict=True):
+        used = np.asarray(setting.spectra.weight) == 1
+        power = np.abs(np.asarray(linear.left) * np.asarray(setting.scale))[used] ** 2
+        power = power[:, np.asarray(setting.spectra.present) > 0]
+        smooth = lambda x: np.stack([np.convolve(c, around, mode="same") for c in x.T], axis=1)  # noqa: E731
+        every.append(np.stack([power, smooth(power), smooth(np.ones_like(power))]).reshape(3, -1))
+    power, others, count = np.concatenate(every, axis=1)
+    alone = (1 + power / np.maximum(others, np.finfo(float).tiny)) ** -count
+    p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
+    share = np.sqrt(power[alone.argmin()] / power.sum()) * _left_share(fit)
+    return Test("lone frequency", p, float(share))
+
+
+def _power(fit: Recalibrated) -> Test:
+    """Whether more is left than the noise that was measured apart."""
+    degrees = sum(n.degrees for n in fit.noises)
+    nuisances = len(fit.change) + sum(len(s.transient) for s in fit.settings)
+    equations = max(fit.equations - nuisances, 1)
+    ratio = fit.squares / equations
+    p = float(betainc(degrees / 2, equations / 2, degrees / (degrees + equations * ratio)))
+    share = np.sqrt(max(1 - 1 / max(ratio, 1e-300), 0.0)) * _left_share(fit)
+    return Test("power beyond the noise", p, share)

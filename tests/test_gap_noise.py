@@ -1,0 +1,109 @@
+"""Noise from periods, repeated records, quiet parts and residuals: its level, its colour, and which was used."""
+
+import numpy as np
+import pytest
+from gap_helpers import SAMPLES, chain, drive, exact, record
+from scipy.signal import lfilter
+
+from jaxsid.checks import InputError
+from jaxsid.gap.noise import noise_of, period_of, quiet_part, residual_noise
+
+LEVEL = 0.05
+
+
+def coloured(shape, seed=0, pole=0.8):
+    white = np.random.default_rng(seed).standard_normal((shape[0] + 200, shape[1]))
+    return LEVEL * lfilter([1], [1, -pole], white, axis=0)[200:]
+
+
+@pytest.mark.parametrize("periods", [2, 4])
+def test_periods(periods):
+    u = drive(periods * 512, periods=periods)
+    (noise,) = noise_of(chain(), [record(u, exact(u) + coloured((len(u), 3)))])
+    assert noise.source == "periods"
+    np.testing.assert_allclose(noise.level, LEVEL, rtol=0.15)
+    np.testing.assert_allclose(noise.taps[:, 1], -0.8, atol=0.1)
+    np.testing.assert_allclose(noise.rms(), LEVEL / 0.6, rtol=0.3)
+
+
+def test_repeated_records():
+    u = drive()
+    records = [record(u, exact(u) + coloured((SAMPLES, 3), seed)) for seed in (1, 2)]
+    noises = noise_of(chain(), records)
+    assert {n.source for n in noises} == {"repeated records"}
+    np.testing.assert_allclose([n.level for n in noises], LEVEL, rtol=0.1)
+
+
+def test_quiet_part():
+    u = np.concatenate([np.zeros(400), drive(1000)])
+    (noise,) = noise_of(chain(), [record(u, exact(u) + coloured((1400, 3)))])
+    assert noise.source == "quiet part"
+    np.testing.assert_allclose(noise.level, LEVEL, rtol=0.15)
+
+
+def test_residual():
+    u = drive()
+    white = LEVEL * np.random.default_rng(0).standard_normal((SAMPLES, 3))
+    (noise,) = noise_of(chain(), [record(u, exact(u) + white)])
+    assert (noise.source, noise.degrees) == ("residual", 0)
+    np.testing.assert_allclose(noise.level, LEVEL, rtol=0.2)
+
+
+def test_an_effect_is_not_taken_for_noise():
+    """A model with springs 20 % too stiff leaves much more than noise, in most of the band."""
+    u = drive()
+    white = LEVEL * np.random.default_rng(0).standard_normal((SAMPLES, 3))
+    (noise,) = noise_of(chain(factor=1.2), [record(u, exact(u) + white)])
+    assert (noise.level < 3 * LEVEL).all()
+
+
+def test_lines_have_the_deviation_that_is_said():
+    signals = coloured((8192, 2), 3)
+    noise = residual_noise(signals)
+    lines = np.fft.rfft(signals, axis=0) / np.sqrt(len(signals))
+    omega = 2 * np.pi * np.arange(len(lines)) / len(signals)
+    whitened = np.abs(lines / noise.deviation(omega, 1.0)) ** 2
+    thirds = [x.mean() for x in np.array_split(whitened, 6)]
+    np.testing.assert_allclose(thirds, 1.0, atol=0.1)
+
+
+@pytest.mark.parametrize("period", [256, 300])
+def test_period_is_found_in_a_noisy_input(period):
+    rng = np.random.default_rng(0)
+    u = np.tile(rng.standard_normal((period, 2)), (5, 1))[: int(4.3 * period)]
+    assert period_of(u + 0.005 * rng.standard_normal(u.shape)) == period
+
+
+def test_no_period_where_there_is_none():
+    t = np.arange(2000) * 0.01
+    assert period_of(np.sin(t**2)[:, None]) is None
+    assert period_of(np.exp(-t)[:, None]) is None
+    assert period_of(np.zeros((2000, 1))) is None
+    assert period_of(np.random.default_rng(0).standard_normal((2000, 1))) is None
+
+
+def test_quiet_parts():
+    u = np.concatenate([np.zeros(200), np.ones(100)])[:, None]
+    assert quiet_part(u) == slice(0, 200)
+    assert quiet_part(u[100:]) is None
+    assert quiet_part(0 * u) == slice(0, 300)
+
+
+def test_absent_sensors_have_none():
+    u = drive()
+    y = exact(u) + coloured((SAMPLES, 3))
+    y[:, 1] = np.nan
+    (noise,) = noise_of(chain(), [record(u, y)])
+    assert np.isnan(noise.level).tolist() == [False, True, False]
+
+
+def test_bad_input():
+    u = drive(200)
+    with pytest.raises(InputError, match="at least one record"):
+        noise_of(chain(), [])
+    y = exact(u)
+    y[7, 1] = np.nan
+    with pytest.raises(InputError, match=r"s1.*NaN"):
+        noise_of(chain(), [record(u, y)])
+    with pytest.raises(InputError, match="too little"):
+        noise_of(chain(), [record(u[:20], y[20:40])])
