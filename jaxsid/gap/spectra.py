@@ -19,6 +19,7 @@ from jaxsid.checks import require, require_finite
 from jaxsid.compilation import compiled
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
+from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.simulate import measured_sensors, ordered_inputs
 from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderModel
@@ -148,7 +149,7 @@ def _spectra(u: Array, y: Array, present: Array, model: _Sampled) -> Spectra:
     z = jnp.where(clear, z, 2.0)[:, None, None]  # a line on a pole is not used
     s = jnp.where(clear, 1j * omega, 1.0)[:, None, None]
     # one batch: factorizations side by side can lock up the CPU's thread pool
-    shifted, smooth = jnp.split(jnp.linalg.inv(jnp.concatenate([z * eye - states.A, s * eye - plain.A])), 2)
+    shifted, smooth = jnp.split(inverse_each(jnp.concatenate([z * eye - states.A, s * eye - plain.A])), 2)
     forced_states = smooth @ plain.B
     inputs = model.linear.input_matrix
     driven_states = forced_states @ inputs if model.band else shifted @ states.B + states.D
