@@ -15,7 +15,7 @@ from jaxsid.gap.recalibrate import as_given, recalibrated
 from jaxsid.mechanics.lumped import Input, Sensor, lumped_model
 
 
-@pytest.mark.parametrize("periods", [1, 3])
+@pytest.mark.parametrize("periods", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_agreement(periods):
     u = drive(SAMPLES, periods=periods)
     found = examine(chain(), record(u, noisy(exact(u))))

@@ -11,13 +11,16 @@ from jaxsid.mechanics.lumped import Connection, Matrices, lumped_model, second_o
 
 CUBIC = ("cubic_stiffness", JOINT, {"coefficient": 3e6})
 B12, B1 = Place("between", ("b1", "b2")), Place("between", ("ground", "b1"))
-CASES = [
+LONG = [  # for the long run
     ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.0}, B12),
-    (*CUBIC, B12),
     ("backlash", (1, 2), {"half_gap": 0.003}, Place("between", ("b2", "b3"))),
+    ("actuator_saturation", 0, {"limit": 9.0}, Place("input", ("drive",))),
+]
+CASES = [
+    (*CUBIC, B12),
     ("quadratic_damping", WALL, {"coefficient": 15.0}, B1),
     ("sensor_delay", 1, {"delay": 0.004}, Place("sensor", ("s1",))),
-    ("actuator_saturation", 0, {"limit": 9.0}, Place("input", ("drive",))),
+    *(pytest.param(*case, marks=pytest.mark.slow) for case in LONG),
 ]
 
 
@@ -65,6 +68,7 @@ def test_force_is_that_of_the_law():
     assert 0 < found.deviation < 0.3 * expected.std()
 
 
+@pytest.mark.slow
 def test_records_that_each_hold_some_sensors():
     parts = []
     for seed, sensors in ((0, (0, 2)), (1, (1,))):
@@ -76,6 +80,7 @@ def test_records_that_each_hold_some_sensors():
     assert {m.record for m in found.maps} == {0, 1}
 
 
+@pytest.mark.slow
 def test_units_do_not_matter():
     """Grams instead of kilograms: the same probabilities."""
     u, y = measured(*CUBIC)
