@@ -106,7 +106,7 @@ def test_the_pictures_of_parameters(fitted):
     figure = plots.correlation_figure(fitted.elements, names, kept)
     shown = np.asarray(figure.axes[0].images[0].get_array())
     np.testing.assert_array_equal(shown, np.asarray(fitted.elements.correlation)[np.ix_(kept, kept)])
-    assert [x.get_text() for x in figure.axes[0].texts] == ["-0.9", "0.6"]
+    assert [x.get_text() for x in figure.axes[0].texts] == ["\N{MINUS SIGN}0.93", "0.61"]
     (gallery,) = (b for b in parameters_section(fitted).blocks if isinstance(b, Gallery))
     assert len(gallery.pictures) == 2
 
@@ -132,6 +132,21 @@ def test_many_values_show_the_least_certain_and_the_most_tied(fitted):
     assert ">e39 " in moved
     assert ">e10 " not in moved
     assert ">e38 " in together
+
+
+def test_a_spring_that_the_model_does_not_have_is_no_parameter(fitted):
+    one = fitted.elements
+    none = dataclasses.replace(
+        one,
+        values=one.values.at[6:8].set(0.0),
+        nominal=one.nominal.at[6].set(0.0),
+        deviation=one.deviation.at[6:8].set(0.0),
+    )
+    rows = {
+        texts(r)[0]: r for r in table(parameters_section(dataclasses.replace(fitted, elements=none))).rows
+    }
+    assert "spring1 stiffness" not in rows
+    assert rows["spring2 stiffness"][3].small == "held at a bound"  # it had one: a fit that would be negative
 
 
 def test_entries_stand_in_for_elements(fitted):
@@ -182,7 +197,7 @@ def test_residuals_that_follow_an_input_or_are_coloured(found):
     assert texts(rows["acc3"])[2] == "no"
     value = float(np.asarray(left.cross_correlation)[np.asarray(left.cross_lags).searchsorted(0) + 5, 1, 0])
     assert texts(rows["acc2"])[3] == f"{value:.3f}"
-    assert rows["acc2"][3].small.startswith("force, 0.0250 s")
+    assert rows["acc2"][3].small.startswith("force, 0.025 s")
     # what is left is next to nothing: rounding
     tiny = dataclasses.replace(bad, train_nrmse=1e-7 * bad.train_nrmse)
     assert residual_section(tiny).blocks[0].tone == "good"

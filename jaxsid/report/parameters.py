@@ -21,7 +21,7 @@ def parameters_section(found: Identification) -> Section:
     values = found.elements or found.entries
     if values is None:
         return Section("Parameters", ())
-    names = value_names(values, found.nominal)
+    values, names = _present(values), value_names(_present(values), found.nominal)
     blocks: list[Block] = [Text(_intro(found)), _table(values, names, found.nominal)]
     blocks.append(Text(correlation_words(values, names)))
     figures = [picture(parameter_figure(values, names, _least_certain(values)), PICTURED)]
@@ -39,6 +39,19 @@ CORRELATED = (
     "Blue: the errors of both go up together; orange: one goes up as the other goes down. White: they have nothing to "
     "do with each other. Strong ones are written."
 )
+
+
+def _present(values: ElementValues) -> ElementValues:
+    """Without springs that the model does not have: a connection may damp only."""
+    value, nominal, std = (np.asarray(x) for x in (values.values, values.nominal, values.deviation))
+    kept = np.flatnonzero((value != 0) | (nominal != 0) | (std != 0))
+    return ElementValues(
+        tuple(values.listed[i] for i in kept),
+        values.values[kept],
+        values.deviation[kept],
+        values.correlation[np.ix_(kept, kept)],
+        values.nominal[kept],
+    )
 
 
 def value_names(values: ElementValues, model: LumpedModel) -> tuple[str, ...]:

@@ -53,8 +53,8 @@ def _picture(found: Identification, left: list[Left]) -> Picture:
 
 
 CAPTION = (
-    "Top: what is left against itself, so much later. Bottom: against the input that it follows most. Dashed: what "
-    "chance exceeds at one lag in a hundred, of white noise (top) and of noise of this colour that has nothing to do "
+    "Top: what is left against itself, so much later. Bottom: the same, made white, against the input that it follows "
+    "most. Dashed: what chance exceeds at one lag in a hundred, if the noise is white (top), if it has nothing to do "
     "with the input (bottom)."
 )
 MEANING = (
@@ -129,4 +129,4 @@ def _number(strongest: tuple[float, float, float, float], which: str) -> Cell:
     value, lag, reach, _ = strongest
     if not np.isfinite(value):
         return Cell(MISSING)
-    return Cell(minus(f"{value:.3f}"), f"{which}{significant(lag, 3)} s; chance {significant(reach, 2)}")
+    return Cell(minus(f"{value:.3f}"), f"{which}{lag:.3g} s; chance {significant(reach, 2)}")

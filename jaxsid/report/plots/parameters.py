@@ -8,12 +8,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxsid.physical.elements import ElementValues
+from jaxsid.report.numbers import minus
 from jaxsid.report.plots.matrices import SIGNED
 from jaxsid.report.style import BLUE, INK, MUTED, ORANGE, WIDTH, label, log_scale, new_figure, shortened
 
 LINE = 0.19  # inches of height for a value
-NAME = 22  # characters of a value's name
-NAMES, RIGHT, TOP = 1.5, 0.14, 0.4  # inches for names, at the right, for a title
+NAME = 20  # characters of a value's name
+NAMES, RIGHT, TOP = 1.56, 0.14, 0.4  # inches for names, at the right, for a title
 WRITTEN = 12  # values up to which correlations are written as numbers
 STRONG = 0.5  # from which on
 
@@ -81,7 +82,7 @@ def correlation_figure(values: ElementValues, names: tuple[str, ...], kept: np.n
     ax.tick_params(axis="x", rotation=90)
     if len(kept) <= WRITTEN:
         for i, j in np.argwhere(np.tril(np.abs(np.nan_to_num(shown)) >= STRONG, -1)):
-            ax.text(j, i, f"{shown[i, j]:.1f}", ha="center", va="center", fontsize=7, color=INK)
+            ax.text(j, i, minus(f"{shown[i, j]:.2f}"), ha="center", va="center", fontsize=7, color=INK)
     return figure
 
 

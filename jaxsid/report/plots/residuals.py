@@ -26,7 +26,7 @@ def residual_figure(found: Identification, outputs: Sequence[str], record: int =
     left, given = found.residuals[record], found.records[record]
     name = "" if len(found.records) == 1 else f" of {PurePath(given.name).name}"
     figure, axes = new_figure(
-        f"Correlation of what is left{name}", 4.2, rows=2, between=0.9, left=0.74, top=0.78
+        f"Correlation of what is left{name}", 4.2, rows=2, between=0.74, left=0.74, top=0.78
     )
     own, crossed = axes[:, 0]
     for output, colour in zip(outputs, COLOURS, strict=False):
