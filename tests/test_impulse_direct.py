@@ -101,6 +101,7 @@ def test_a_given_ridge_is_the_dense_regularized_solution():
     np.testing.assert_allclose(h[:, :, 0], dense, atol=1e-5 * np.abs(dense).max())
 
 
+@pytest.mark.slow
 def test_unequal_lengths_are_an_ensemble():
     records = [white(seed=i, samples=n, inputs=1) for i, n in enumerate((1024, 700, 900))]
     together = error(Direct()(records, samples=400).h, markov(CHAIN, 0.02, 400)[:, :, :1])
@@ -137,6 +138,7 @@ def small(y, u):
     return Direct(steps=20)([Record(u, y, 0.02)], samples=50).h
 
 
+@pytest.mark.slow
 def test_jit_vmap_and_derivative():
     record = white(samples=200, inputs=1)
     u, y = record.u, record.y

@@ -229,7 +229,7 @@ def values_of(model, u, **parameters):
 @pytest.mark.parametrize(
     ("kind", "place", "parameters"),
     [
-        ("coulomb_friction", WALL, {"force": 3.0}),
+        pytest.param("coulomb_friction", WALL, {"force": 3.0}, marks=pytest.mark.slow),
         ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.3}),
         pytest.param("backlash", JOINT, {"half_gap": 0.002}, marks=pytest.mark.slow),
         ("input_delay", 0, {"delay": 0.0034}),

@@ -142,6 +142,7 @@ def with_another_mass(seed, samples=20000):
     return u, y + 0.01 * y.std(axis=0) * rng.standard_normal(y.shape)
 
 
+@pytest.mark.slow
 def test_a_mass_that_the_model_lacks_is_missed(model):
     record = recorded(model, *with_another_mass(1))
     found = identify(model, record)

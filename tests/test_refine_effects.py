@@ -87,6 +87,7 @@ def test_friction_and_all_elements_from_wrong_values(rubbing):
     assert (np.sqrt(((again - y) ** 2).mean(axis=0)) < np.hypot(0.012, 2 * spike) * y.std(axis=0)).all()
 
 
+@pytest.mark.slow
 def test_windows_records_and_absent_sensors(rubbing):
     """Two records, one with one sensor, in windows; what is fixed or tied keeps its value or ratio."""
     half = [
