@@ -1,6 +1,5 @@
 """Is what a model leaves of records noise? The strongest correlations, and a warning where the inputs are in it."""
 
-import dataclasses
 from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
@@ -9,7 +8,6 @@ import numpy as np
 
 from jaxsid.pipeline.correlations import ONE_PERCENT
 from jaxsid.records import Residuals
-from jaxsid.refinement import Refinement
 
 CHANCE = (
     1e-4  # of calling any correlation of noise more than chance, over all lags, outputs, inputs and records
@@ -124,16 +122,3 @@ def input_warning(
 
 def _told(output: str, given: str, value: float, lag: float, score: float) -> str:
     return f"{output} with {given}, correlation {value:.2g} at a lag of {lag:.3g} s, {score:.3g} standard deviations"
-
-
-def with_input_warning(found: Refinement) -> Refinement:
-    """The same with a warning more where what is left of its record follows the inputs.
-
-    Args:
-        found: a refinement; without residuals it stays as it is.
-    """
-    if found.residuals is None:
-        return found
-    names = tuple(i.name for i in found.nominal.inputs)
-    said = input_warning((found.residuals,), ("",), found.outputs, (names,), np.asarray(found.after))
-    return dataclasses.replace(found, warnings=(*found.warnings, *said))

@@ -15,9 +15,8 @@ from jaxsid.physical.elements import LinearMatrices, element_matrices, with_valu
 from jaxsid.physical.motion import Left, MotionTerm, counted
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.correlations import correlations
-from jaxsid.pipeline.misses import with_input_warning
 from jaxsid.pipeline.motion_terms import Windows, lowest_frequency, motion_term, window_length
-from jaxsid.pipeline.refining import Manner, Problem, concluded, nominal_unknowns, solved
+from jaxsid.pipeline.refining import Manner, Problem, concluded, nominal_unknowns, solved, with_input_warning
 from jaxsid.records import Record, Residuals, as_array
 from jaxsid.refinement import Refinement, Validation
 

@@ -15,8 +15,15 @@ from jaxsid.physical.terms import LineTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.correlations import correlations
 from jaxsid.pipeline.matrices import sensed_rows
-from jaxsid.pipeline.misses import with_input_warning
-from jaxsid.pipeline.refining import Manner, Problem, concluded, fitted_model, nominal_unknowns, solved
+from jaxsid.pipeline.refining import (
+    Manner,
+    Problem,
+    concluded,
+    fitted_model,
+    nominal_unknowns,
+    solved,
+    with_input_warning,
+)
 from jaxsid.pipeline.setting import setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
 from jaxsid.records import Record, Residuals, as_array

@@ -1,5 +1,6 @@
 """What every refinement does, whatever the data: fit from several starts, covariance, validation, warnings."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from jaxsid.physical.posterior import Data, Solver, from_each, squares_at
 from jaxsid.physical.profile import Profile, profile
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.matrices import GOOD, POOR
+from jaxsid.pipeline.misses import input_warning
 from jaxsid.records import as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
@@ -288,3 +290,16 @@ def relative_error(left: np.ndarray, whole: np.ndarray) -> Float[np.ndarray, " o
     """
     size = np.sqrt((np.abs(whole) ** 2).mean(axis=(0, 2)))
     return np.sqrt((np.abs(left) ** 2).mean(axis=(0, 2))) / np.where(size > 0, size, 1.0)
+
+
+def with_input_warning(found: Refinement) -> Refinement:
+    """The same with a warning more where what is left of its record follows the inputs.
+
+    Args:
+        found: a refinement; without residuals it stays as it is.
+    """
+    if found.residuals is None:
+        return found
+    names = tuple(i.name for i in found.nominal.inputs)
+    said = input_warning((found.residuals,), ("",), found.outputs, (names,), np.asarray(found.after))
+    return dataclasses.replace(found, warnings=(*found.warnings, *said))
