@@ -136,6 +136,7 @@ def test_identify_writes_numbers_model_and_report(files):
     assert (np.std(y[:, 1:] - truth[:, 2:], axis=0) / np.std(truth[:, 2:], axis=0)).max() < 0.011
 
 
+@pytest.mark.slow
 def test_without_refinement(files, columns):
     model, record, out = files
     result = call("identify", model, record, "--out", out, "--no-refine")

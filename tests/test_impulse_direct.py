@@ -109,6 +109,7 @@ def test_unequal_lengths_are_an_ensemble():
     assert together < min(alone, 0.05)
 
 
+@pytest.mark.slow
 def test_unknown_history():
     """A record cut out of a longer one is not at rest at its start; the taps must outlast the response."""
     record = white(samples=6000, inputs=1, level=1e-3, dt=0.05)
@@ -156,6 +157,7 @@ def test_jit_vmap_and_derivative():
     assert float(jax.grad(fixed)(1.0)) == pytest.approx(float(difference), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_single_precision(single_precision):
     record = white(samples=1024, inputs=1)
     ir = Direct()([Record(np.asarray(record.u, np.float32), np.asarray(record.y, np.float32), 0.02)])

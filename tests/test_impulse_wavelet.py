@@ -60,7 +60,7 @@ def test_a_coarse_subspace_regularizes():
     assert error(Direct()([record]).h, truth) < 0.05
 
 
-@pytest.mark.parametrize("dt", [1e-3, 0.02])
+@pytest.mark.parametrize("dt", [pytest.param(1e-3, marks=pytest.mark.slow), 0.02])
 def test_white_excitation_with_noise(dt):
     rng = np.random.default_rng(0)
     u = np.zeros((4096, 3))
@@ -116,6 +116,7 @@ def test_dropping_is_the_same_for_an_unnormalized_transform():
     np.testing.assert_allclose(a, b, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_averaging_reduces_the_error():
     truth = markov(CHAIN, 0.1, 129)[:, :, :2]
     errors = [error(WaveletEnsemble(taps=128)(ensemble(n)).h, truth) for n in (3, 12)]

@@ -164,6 +164,7 @@ def test_several_effects_in_any_order_and_direction():
     assert error(jaxsid.simulate(chain(halves), record(u)), alone) < 1e-3
 
 
+@pytest.mark.slow
 def test_contacts_that_act_on_each_other():
     """Friction on both sides of a body: each rests or slides as if the other were known."""
     u = drive(600)
@@ -230,7 +231,12 @@ def values_of(model, u, **parameters):
     ("kind", "place", "parameters"),
     [
         pytest.param("coulomb_friction", WALL, {"force": 3.0}, marks=pytest.mark.slow),
-        ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.3}),
+        pytest.param(
+            "hysteresis",
+            JOINT,
+            {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.3},
+            marks=pytest.mark.slow,
+        ),
         pytest.param("backlash", JOINT, {"half_gap": 0.002}, marks=pytest.mark.slow),
         ("input_delay", 0, {"delay": 0.0034}),
         pytest.param("sensor_lag", 0, {"time_constant": 0.004}, marks=pytest.mark.slow),
@@ -288,6 +294,7 @@ def test_single_precision():
     assert error(single, double) < 1e-3
 
 
+@pytest.mark.slow
 def test_initial_state_with_hidden_states_is_found():
     u = drive(1600)
     kinds = ((0, "acceleration"), (1, "displacement"), (2, "velocity"))

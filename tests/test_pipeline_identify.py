@@ -130,7 +130,7 @@ def run(row, seed, **options):
 
 
 # Every row in `test_accuracy_over_many_records`, which is slow: each new size of a system compiles for long.
-@pytest.mark.parametrize("name", ["one force", "mixed", "free"])
+@pytest.mark.parametrize("name", ["one force", "mixed", pytest.param("free", marks=pytest.mark.slow)])
 def test_accuracy_from_one_noisy_record(name):
     row = ROWS[name]
     found = run(row, 1)
@@ -211,6 +211,7 @@ def test_a_start_in_motion_does_not_disturb(model):
     assert min(identify(model, record, initial="rest").train_nrmse) > 0.05
 
 
+@pytest.mark.slow
 def test_two_sampling_rates_of_one_system(model):
     records = [recorded(model, *experiment(SYSTEM, 6, dt=dt), dt) for dt in (1e-3, 2e-3)]
     found = identify(model, records)
@@ -234,6 +235,7 @@ def test_a_roving_sensor(model):
     check(found, SYSTEM, USUAL)
 
 
+@pytest.mark.slow
 def test_linear_hold():
     model = nominal(SYSTEM, hold="first")
     rng = np.random.default_rng(7)
@@ -275,6 +277,7 @@ def test_fewer_sensors_than_bodies_still_give_modes(model, noisy):
     assert any("No record holds s3" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 def test_an_order_that_is_not_the_models_gives_modes_without_matrices(model, noisy):
     found = identify(model, noisy, order=8)
     assert (found.order, found.matrices) == (8, None)
@@ -283,14 +286,16 @@ def test_an_order_that_is_not_the_models_gives_modes_without_matrices(model, noi
     assert nearest_modes(found, SYSTEM)[:, 0].max() < USUAL.frequency
 
 
+@pytest.mark.slow
 def test_data_correlations(model, noisy):
     found = identify(model, noisy, realization="era_dc")
     check(found, SYSTEM, USUAL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [*(pytest.param(x, marks=pytest.mark.slow) for x in (Wavelet(), Direct())), Fourier()],
+    [Wavelet(), Direct(), Fourier()],
     ids=["wavelet", "direct", "fourier"],
 )
 def test_other_estimators_on_a_full_band_record(model, method):
@@ -377,6 +382,7 @@ def test_an_unstable_system_keeps_its_pole_and_is_said_to_be_unstable():
     assert np.isnan(np.asarray(found.train_nrmse)).all()
 
 
+@pytest.mark.slow
 def test_a_hold_that_is_not_the_forces_is_noticed():
     """Forces that go on between the samples: as if held they spoil the fit, which says so; "band" is exact."""
     rng = np.random.default_rng(0)

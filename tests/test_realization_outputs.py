@@ -70,7 +70,7 @@ def test_few_directions_are_used_where_they_pay(monkeypatch):
     assert seen == [8]
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivative_in_directions_that_the_outputs_lack(mode):
     """A change that leaves the few directions moves the shapes, though the response itself has no such part."""
     h = many()

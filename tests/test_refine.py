@@ -35,7 +35,7 @@ def pulls(found):
     return (np.asarray(found.elements.values) - TRUTH) / np.asarray(found.elements.deviation)
 
 
-@pytest.mark.parametrize("name", ["one", "three"])
+@pytest.mark.parametrize("name", [pytest.param("one", marks=pytest.mark.slow), "three"])
 def test_exact_responses_give_exact_values_from_far_away(name):
     elements, samples = CHAINS[name]
     ir = exact_response(chain_model(elements), samples)
@@ -95,6 +95,7 @@ def test_coloured_noise_that_is_known_is_weighed_and_covered():
     assert np.sqrt(np.square(weighed).mean(axis=0))[0] < 0.7 * np.sqrt(np.square(plain).mean(axis=0))[0]
 
 
+@pytest.mark.slow
 def test_noise_known_from_repeats_widens_the_deviations_as_it_must():
     rng = np.random.default_rng(0)
     factor = rng.standard_normal((30, *EXACT.h.shape)) * SIZE[:, None] / np.sqrt(29)
@@ -105,6 +106,7 @@ def test_noise_known_from_repeats_widens_the_deviations_as_it_must():
     assert ratio.max() < 1.6
 
 
+@pytest.mark.slow
 def test_held_tied_and_prior_values():
     model = chain_model(THREE, np.array([1, 1, 1, 0.8, 0.8, 1.1, 1.2, 0.9, 0.8]))
     found = refine(
@@ -144,6 +146,7 @@ def test_bounds_hold_and_the_rest_is_the_best_that_they_allow():
     np.testing.assert_allclose(np.asarray(found.elements.values) / TRUTH, wanted.x, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_told_apart_is_said_and_a_prior_settles_it():
     """Two springs side by side: only their sum acts."""
     from jaxsid.mechanics.lumped import Connection, lumped_model
@@ -235,6 +238,7 @@ def test_raw_records_with_residuals_that_are_noise():
     assert (np.abs(np.asarray(left.autocorrelation)[1:]) < left.white_limit).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_a_hidden_sensor_and_two_records():
     records = [recorded(seed, None, (0, 2)) for seed in (7, 8)]
     found = refine(wrong(7), records)

@@ -114,7 +114,8 @@ def test_records_without_noise():
     close(make("chain2", data="record", noise=0.0, samples=60, record_samples=256), 1e-6)
 
 
-@pytest.mark.parametrize("method", ["direct", pytest.param("wavelet", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["direct", "wavelet"])
 def test_regularized_estimates_are_nearly_right_without_noise(method):
     values = {"data": "record", "method": method, "noise": 0.0, "samples": 60, "record_samples": 256}
     experiment = make("chain2", **values)

@@ -244,7 +244,9 @@ def from_a_tone(name, level):
     return pole_error(jaxsid.modal(rz).poles, poles)
 
 
-@pytest.mark.parametrize("name", TONES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x == "rig" else x for x in TONES]
+)
 def test_a_noise_free_tone_gives_the_poles(name):
     """Through its start from rest, not through the tone: see test_impulse_tone.py."""
     assert from_a_tone(name, 0.0) < 1e-8
@@ -255,7 +257,7 @@ def test_a_noise_free_tone_gives_the_poles(name):
     [
         ("1 DOF", 1e-2, 0.01),
         pytest.param("3 DOF", 1e-2, 0.2, marks=pytest.mark.slow),
-        ("rig", 1e-2, 0.2),
+        pytest.param("rig", 1e-2, 0.2, marks=pytest.mark.slow),
         pytest.param("3 DOF", 1e-6, 0.01, marks=pytest.mark.slow),
         pytest.param("rig", 1e-6, 0.2, marks=pytest.mark.slow),
     ],

@@ -102,7 +102,8 @@ def test_velocities_of_a_free_pair_show_three_states():
     assert np.sort(np.asarray(indicators.mac))[0] < 0.5
 
 
-@pytest.mark.parametrize("step", [2.0, pytest.param(0.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [2.0, 0.5])
 def test_the_slow_mode_of_the_thesis_is_the_fourth_state(step):
     """The excitation starts at 20 Hz, so the slow part of the response is in error. A fourth state takes that
     error up and makes a slow pair with the real pole -4.9, for every draw and for ERA and ERA/DC: the thesis's

@@ -148,7 +148,6 @@ def _spectra(u: Array, y: Array, present: Array, model: _Sampled) -> Spectra:
     clear = jnp.abs(z[:, None] - model.poles).min(axis=1) > CLEAR
     z = jnp.where(clear, z, 2.0)[:, None, None]  # a line on a pole is not used
     s = jnp.where(clear, 1j * omega, 1.0)[:, None, None]
-    # one batch: factorizations side by side can lock up the CPU's thread pool
     shifted, smooth = jnp.split(inverse_each(jnp.concatenate([z * eye - states.A, s * eye - plain.A])), 2)
     forced_states = smooth @ plain.B
     inputs = model.linear.input_matrix

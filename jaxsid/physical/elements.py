@@ -270,12 +270,17 @@ def _entries(model: LumpedModel) -> Parts:
         held = np.diag(springs).any()
         springs, heavy = ~np.diag(np.full(len(mass), not held)), np.ones_like(heavy)
     found = [_masses(mass, heavy), _joints(damping, springs | _joined(damping)), _joints(stiffness, springs)]
-    listed = [[_pair(names[i], names[j]) for i, j, _, _ in one] for one in found]
+    listed = [[pair_name(names[i], names[j]) for i, j, _, _ in one] for one in found]
     shapes = [np.array([x for *_, x in one]).reshape(-1, *[len(model.bodies)] * 2) for one in found]
     return shapes, listed, [np.array([value for _, _, value, _ in one]) for one in found]
 
 
-def _pair(one: str, other: str) -> str:
+def pair_name(one: str, other: str) -> str:
+    """Name of what joins two ends, or of a body's own.
+
+    Args:
+        one, other: names of the ends.
+    """
     return one if one == other else f"{one}, {other}"
 
 

@@ -6,16 +6,13 @@ Where errors are normal and small it is ((v - value) / deviation)^2; where it is
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.interpolate import PchipInterpolator
 
-from jaxsid.compilation import compiled
-from jaxsid.physical.bounded import BoundedFit
-from jaxsid.physical.elements import LinearMatrices
-from jaxsid.physical.posterior import Data, most_probable
+from jaxsid.checks import InputError
+from jaxsid.physical.bounded import BoundedFit, within_bounds
+from jaxsid.physical.posterior import Data
 from jaxsid.physical.restrictions import Prior, Restricted
 from jaxsid.records import as_array
 
@@ -43,28 +40,6 @@ class Profile(eqx.Module):
     interval: Float[Array, "2"]
 
 
-@compiled
-def _held(
-    terms: tuple[Data, ...],
-    unknowns: LinearMatrices,
-    prior: Prior,
-    which: Float[Array, " p"],
-    starts: Float[Array, "g p"],
-) -> Float[Array, " g"]:
-    """-2 log posterior with one unknown, marked by 1, held where the starts have it."""
-    mix, weight = jnp.asarray(unknowns.mix), jnp.asarray(prior.weight)
-    others = Prior(prior.mean, weight * (1 - which))
-
-    def at(start: Array) -> Array:
-        base = jnp.asarray(unknowns.base) + mix @ (which * start * unknowns.scale)
-        rest = eqx.tree_at(lambda x: (x.base, x.mix), unknowns, (base, mix * (1 - which)))
-        found = most_probable(terms, rest, others, start)
-        r, _ = prior.rows(jnp.where(which > 0, start, found.theta))
-        return found.squares + r @ r
-
-    return jax.lax.map(at, starts)
-
-
 def profile(
     terms: tuple[Data, ...],
     known: Restricted,
@@ -78,7 +53,7 @@ def profile(
     Args:
         terms: the data.
         known: bounds and priors.
-        fit: the best one; what else a bound holds there stays held.
+        fit: the best one. Bounds and positive matrices hold at every other point as they do there.
         covariance: of the unknowns, for first steps.
         misfit: mean square residual, which the rise is divided by where it is above 1.
         which: number of the unknown.
@@ -86,16 +61,12 @@ def profile(
     Source: S. A. Murphy and A. W. van der Vaart, J. Am. Stat. Assoc. 95 (2000).
     """
     best, scale = np.asarray(fit.posterior.theta), np.asarray(known.unknowns.scale)
-    still = fit.at_bound & (np.arange(len(best)) != which)
-    unknowns = known.unknowns.held(still, best * scale)
-    prior = Prior(known.prior.mean, np.where(still, 0.0, np.asarray(known.prior.weight)))
+    mark = np.arange(len(best)) == which
     ends = (known.lower / scale)[which], (known.upper / scale)[which]
-    r, _ = prior.rows(jnp.asarray(best))
-    least = float(fit.posterior.squares + r @ r)
+    least = _squares(known, fit, best)
     told = np.isfinite(covariance[which, which]) and covariance[which, which] > 0
     usual = float(np.sqrt(covariance[which, which])) if told else UNTOLD
     along = covariance[:, which] / covariance[which, which] if told else np.zeros(len(best))
-    mark = np.arange(len(best)) == which
     along = np.where(mark, 1.0, along)
 
     def side(sign: float) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +77,7 @@ def profile(
             if not values.size:
                 break
             starts = best + (values - best[which])[:, None] * along
-            squares = np.asarray(_held(terms, unknowns, prior, jnp.asarray(1.0 * mark), jnp.asarray(starts)))
+            squares = np.array([_held(terms, known, mark, start) for start in starts])
             rise = np.where(np.isfinite(squares), squares - least, np.inf) / max(misfit, 1.0)
             if rise.max() > LIMIT or values[-1] in ends:
                 return values, rise
@@ -122,12 +93,40 @@ def profile(
     )
 
 
+def _held(
+    terms: tuple[Data, ...], known: Restricted, mark: Bool[np.ndarray, " p"], start: np.ndarray
+) -> float:
+    """-2 log posterior with the marked unknown held where the start has it, the others fitted from there."""
+    others = known._replace(
+        unknowns=known.unknowns.held(mark, start * np.asarray(known.unknowns.scale)),
+        prior=Prior(known.prior.mean, np.where(mark, 0.0, np.asarray(known.prior.weight))),
+        lower=np.where(mark, -np.inf, known.lower),
+        upper=np.where(mark, np.inf, known.upper),
+    )
+    try:
+        fit = within_bounds(terms, others, as_array(start))
+    except InputError:  # no positive matrix has this value
+        return np.inf
+    return _squares(known, fit, np.where(mark, start, np.asarray(fit.posterior.theta)))
+
+
+def _squares(known: Restricted, fit: BoundedFit, at: np.ndarray) -> float:
+    """-2 log posterior of a fit, with the prior of all unknowns."""
+    rows, _ = known.prior.rows(as_array(at))
+    return float(fit.posterior.squares + rows @ rows)
+
+
 def _crossing(best: float, values: np.ndarray, rise: np.ndarray, end: float) -> float:
-    """Where the rise first comes to the limit, along its root, which is nearly straight; else the end."""
+    """Where the rise first comes to the limit, along its root, which is nearly straight; else the end.
+
+    Values that no fit has lie outside.
+    """
     root = np.sqrt(np.maximum(np.concatenate([[0.0], rise]), 0.0))
     beyond = np.flatnonzero(root >= np.sqrt(LIMIT))
-    if not beyond.size or not np.isfinite(root[beyond[0]]):
+    if not beyond.size:
         return end
+    if not np.isfinite(root[beyond[0]]):
+        return float(values[beyond[0] - 1])
     until = beyond[0] + 1
     rising = root[:until] > np.concatenate([[-1.0], np.maximum.accumulate(root[: until - 1])])
     at = np.concatenate([[best], values])[:until][rising]

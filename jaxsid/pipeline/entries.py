@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxsid.mechanics.lumped import LumpedModel, second_order
-from jaxsid.physical.elements import QUANTITIES, Element, ElementValues
+from jaxsid.physical.elements import QUANTITIES, Element, ElementValues, pair_name
 from jaxsid.physical.inband_fit import MatrixFit
 from jaxsid.records import as_array
 
@@ -34,7 +34,7 @@ def fitted_entries(fit: MatrixFit, model: LumpedModel) -> ElementValues:
     numbers = np.stack([np.asarray(getattr(nominal, quantity))[upper] for quantity in QUANTITIES])
     return ElementValues(
         tuple(
-            Element(_name(model.bodies[a], model.bodies[b]), QUANTITIES[w])
+            Element(pair_name(model.bodies[a], model.bodies[b]), QUANTITIES[w])
             for w, a, b in zip(which, i, j, strict=True)
         ),
         values=as_array(matrices[which, entry]),
@@ -42,7 +42,3 @@ def fitted_entries(fit: MatrixFit, model: LumpedModel) -> ElementValues:
         correlation=as_array(covariance / safe / safe[:, None]),
         nominal=as_array(numbers[which, entry]),
     )
-
-
-def _name(one: str, other: str) -> str:
-    return one if one == other else f"{one}, {other}"

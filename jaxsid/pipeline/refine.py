@@ -1,11 +1,12 @@
 """Refinement of a model's numbers against measurements: records, impulse responses or frequency responses."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxsid.checks import is_concrete, require
+from jaxsid.checks import JaxsidError, is_concrete, require
 from jaxsid.impulse.spectra import FrequencyResponse
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.physical.elements import as_full
@@ -93,22 +94,12 @@ def refine(
     Source: R. Pintelon and J. Schoukens, System Identification, 2nd ed., ch. 9; M. Friswell and J. Mottershead, Finite
     Element Model Updating in Structural Dynamics, 1995.
     """
-    of_records = isinstance(data, (Record, Sequence))
-    require(
-        of_records or not model.effects,
-        f"{model.name}: it has effects, of which an impulse or frequency response cannot tell. Give records.",
-    )
-    require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
-    require(window is None or window >= 0, f"window must not be negative, it is {window} s.")
-    require(structure in STRUCTURES, f"structure '{structure}' is unknown; choose 'model' or 'free'.")
-    require(starts >= 0, f"starts must not be negative, it is {starts}.")
+    _check(model, data, initial, window, structure, starts)
     near = None
     if structure == "free":
-        plain = is_concrete(model.mass) and not (model.effects or fixed or tied or bounds or priors)
-        if plain and not (isinstance(data, ImpulseResponse) and not is_concrete(data.h)):
-            # fewer unknowns find the way more surely: the model's own numbers first
+        if is_concrete(model.mass) and not (model.effects or fixed or tied or bounds or priors):
             options = {"noise": noise, "dt": dt, "band": band, "window": window, "initial": initial}
-            near = refine(model, data, validate=False, solver=solver, progress=progress, **options).model
+            near = _nearby(model, data, solver=solver, progress=progress, **options)
         model = as_full(model)
     known = restricted(model, fixed=fixed, tied=tied, bounds=bounds, priors=priors)
     how = Manner(
@@ -132,6 +123,38 @@ def refine(
         require(band is None, "band is for fits to lines of the spectrum; this one is in time.")
         return refine_motion(model, known, records, window, initial, how)
     return refine_records(model, known, records, band, how)
+
+
+def _check(
+    model: LumpedModel,
+    data: Record | Sequence[Record] | ImpulseResponse | FrequencyResponse,
+    initial: str,
+    window: float | None,
+    structure: str,
+    starts: int,
+) -> None:
+    require(
+        isinstance(data, (Record, Sequence)) or not model.effects,
+        f"{model.name}: it has effects, of which an impulse or frequency response cannot tell. Give records.",
+    )
+    require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
+    require(window is None or window >= 0, f"window must not be negative, it is {window} s.")
+    require(structure in STRUCTURES, f"structure '{structure}' is unknown; choose 'model' or 'free'.")
+    require(starts >= 0, f"starts must not be negative, it is {starts}.")
+
+
+def _nearby(
+    model: LumpedModel,
+    data: Record | Sequence[Record] | ImpulseResponse | FrequencyResponse,
+    **options: Any,
+) -> LumpedModel | None:
+    """The model with its own numbers refined: fewer unknowns find the way more surely. None where they do not."""
+    if isinstance(data, ImpulseResponse) and not is_concrete(data.h):
+        return None
+    try:
+        return refine(model, data, validate=False, **options).model
+    except JaxsidError:  # a value that nothing depends on, say, which free matrices do not have
+        return None
 
 
 def _further(known: Restricted, count: int, seed: int, near: LumpedModel | None) -> Array | None:

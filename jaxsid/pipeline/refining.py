@@ -20,7 +20,7 @@ from jaxsid.physical.elements import (
     with_values,
 )
 from jaxsid.physical.parameterization import BLIND
-from jaxsid.physical.posterior import Data, Solver, from_each, squares_at
+from jaxsid.physical.posterior import Data, Solver, from_each, gradient_at, squares_at
 from jaxsid.physical.profile import Profile, profile
 from jaxsid.physical.restrictions import Restricted
 from jaxsid.pipeline.matrices import GOOD, POOR
@@ -28,6 +28,10 @@ from jaxsid.pipeline.misses import input_warning
 from jaxsid.records import as_array
 from jaxsid.refinement import Refinement, Residuals, Validation
 
+LOST = (
+    "The fit ran away to where nothing in the data depends on {} any more: do not use these values. Start from better "
+    "ones, set bounds, or ask for more `starts`."
+)
 BETTER = -1.0  # rise of a profile that shows a better optimum
 FAINT = 0.01  # part of a combination, next to its largest, that is not named
 Errors = Callable[[LumpedModel], np.ndarray]  # of the outputs, relative
@@ -100,15 +104,26 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
             "the model's numbers lead to a response that is not finite, so that no fit can start from them. Check that "
             "masses are positive and that springs and dampers are not negative."
         )
-    _check_told(known, best)
+    _check_told(problem, best)
     if problem.train is None:
         return best, None
     return within_bounds(problem.every, known, best.posterior.theta, problem.solver), best
 
 
-def _check_told(known: Restricted, fit: BoundedFit) -> None:
+def _silent(known: Restricted, fit: BoundedFit) -> list[str]:
+    """Unknowns on which nothing depends where the fit ended."""
     told = (np.diag(np.asarray(fit.posterior.information)) > 0) | (np.asarray(known.prior.weight) > 0)
-    silent = [name for name, t, held in zip(known.names, told, fit.at_bound, strict=True) if not (t or held)]
+    return [name for name, t, held in zip(known.names, told, fit.at_bound, strict=True) if not (t or held)]
+
+
+def _check_told(problem: Problem, fit: BoundedFit) -> None:
+    """Raise where nothing depends on an unknown anywhere; that a fit ran away to where nothing does is no such case."""
+    known = problem.known
+    silent = _silent(known, fit)
+    if not silent:
+        return
+    slope = np.asarray(gradient_at(problem.every, known.unknowns, known.prior, problem.starts[-1]))
+    silent = [name for name in silent if slope[known.names.index(name)] == 0]
     require(
         not silent,
         f"nothing in these data depends on {', '.join(silent)}. Fix it, give it a prior, or measure where it acts.",
@@ -193,6 +208,7 @@ def concluded(
         for which in problem.profiled
     )
     combinations = _open(unknowns, certain.information, problem.known.names)
+    lost = _silent(problem.known, fit)
     return Refinement(
         nominal=model,
         model=refined,
@@ -210,6 +226,7 @@ def concluded(
         open_combinations=combinations,
         converged=fit.posterior.converged,
         warnings=(
+            *((LOST.format(", ".join(lost)),) if lost else ()),
             *_warnings(certain.misfit, values, held, combinations, validation, bool(fit.posterior.converged)),
             *_about_profiles(profiles),
         ),
