@@ -250,7 +250,7 @@ def _read(path: Path) -> _Program | None:
 @functools.cache
 def _load_lapack() -> None:
     """Lowering a factorization hands LAPACK's addresses to XLA; an executable without them would crash."""
-    jax.jit(jnp.linalg.cholesky).lower(jnp.eye(1))
+    jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.float32))
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -24,7 +24,7 @@ from jaxsid.report.plots import (
 from jaxsid.report.plots.impulse import ROWS, plain_time
 from jaxsid.report.results import MATRICES
 
-TIME_FIGURES, FREQUENCY_FIGURES, SHAPES, IMPULSES = 6, 6, 8, 3
+TIME_FIGURES, FREQUENCY_FIGURES, SHAPES, IMPULSES = 6, 4, 8, 3
 REFINED = (
     ", which a least-squares fit to the records then refines: with the values of the nominal model's own masses, "
     "springs and dampers unless the records contradict that structure, else with free symmetric matrices. "

@@ -42,7 +42,7 @@ def _cards(found: Identification) -> tuple[Card, ...]:
     if worst is not None:
         floor = float(np.asarray(found.noise_floor)[worst])
         fit = f"{found.outputs[worst]}; noise alone leaves {percent(floor)}"
-    largest = MISSING if worst is None else percent(float(found.train_nrmse[worst]))
+    largest = MISSING if worst is None else percent(float(np.asarray(found.train_nrmse)[worst]))
     seen = [mode.frequency for mode in modes if not mode.real]
     span = "no vibration mode"
     if seen:

@@ -72,7 +72,7 @@ def modes_of(found: Identification) -> tuple[Mode, ...]:
         Mode(
             int(i),
             _clean(complex(poles[i])),
-            complex(found.pole_std[i]),
+            complex(np.asarray(found.pole_std)[i]),
             float(numbers[0][i] / (2 * np.pi)),
             float(numbers[1][i] / (2 * np.pi)),
             float(numbers[2][i]),

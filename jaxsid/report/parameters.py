@@ -5,6 +5,7 @@ import numpy as np
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues
+from jaxsid.records import as_array
 from jaxsid.report.frame import Block, Cell, Gallery, Section, Table, Text, picture
 from jaxsid.report.numbers import MISSING, change, minus, significant
 from jaxsid.report.plots import correlation_figure, parameter_figure
@@ -47,10 +48,10 @@ def _present(values: ElementValues) -> ElementValues:
     kept = np.flatnonzero((value != 0) | (nominal != 0) | (std != 0))
     return ElementValues(
         tuple(values.listed[i] for i in kept),
-        values.values[kept],
-        values.deviation[kept],
-        values.correlation[np.ix_(kept, kept)],
-        values.nominal[kept],
+        as_array(value[kept]),
+        as_array(std[kept]),
+        as_array(np.asarray(values.correlation)[np.ix_(kept, kept)]),
+        as_array(nominal[kept]),
     )
 
 

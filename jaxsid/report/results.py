@@ -86,10 +86,10 @@ def elements_json(elements: ElementValues) -> list[dict[str, Any]]:
     Args:
         elements: values of a model's elements.
     """
-    columns = elements.values, elements.deviation, elements.nominal
+    columns = (np.asarray(x).tolist() for x in (elements.values, elements.deviation, elements.nominal))
     return [
         {"name": x.name, "element": x.element, "quantity": x.quantity}
-        | {"value": float(value), "std": float(std), "nominal": float(nominal)}
+        | {"value": value, "std": std, "nominal": nominal}
         for x, value, std, nominal in zip(elements.listed, *columns, strict=True)
     ]
 

@@ -74,7 +74,7 @@ def shortened(text: str, most: int = 44) -> str:
 
 def style_axes(ax: Axes) -> None:
     ax.set_facecolor("none")
-    ax.tick_params(labelsize=FONT - 0.5, colors=MUTED, length=2.5, width=0.6, which="both")
+    ax.tick_params(labelsize=FONT - 0.5, colors=MUTED, length=2.5, width=0.6)
     for side, spine in ax.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(MUTED)
@@ -91,7 +91,8 @@ def label(ax: Axes, x: str = "", y: str = "") -> None:
 
 
 def title(ax: Axes, text: str) -> None:
-    ax.set_title(text, fontsize=FONT, color=INK, loc="left", pad=3)
+    # at a given height, since to find one takes the extents of all labels
+    ax.set_title(text, fontsize=FONT, color=INK, loc="left", y=1.0, pad=3)
 
 
 def legend(ax: Axes, columns: int = 3, *, inside: str | None = None) -> None:

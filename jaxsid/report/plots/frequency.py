@@ -58,8 +58,8 @@ def frequency_range(found: Identification, fit: FrequencyFit) -> tuple[float, fl
         2 * np.pi
     )
     fastest, slowest = (float(np.max(x, initial=0.0)) for x in (frequencies, frequencies[:1]))
-    low = slowest / 4 if found.response.band is None else min(slowest / 4, float(found.response.band[0]))
-    high = 4 * fastest if found.response.band is None else 1.1 * float(found.response.band[1])
+    low = slowest / 4 if found.response.band is None else min(slowest / 4, float(np.asarray(found.response.band)[0]))
+    high = 4 * fastest if found.response.band is None else 1.1 * float(np.asarray(found.response.band)[1])
     high = min(max(high, 1.3 * fastest), positive[-1])
     return float(max(low, positive[0])), float(max(high, positive[min(10, len(positive) - 1)]))
 
@@ -73,7 +73,7 @@ def mark_modes(axes: np.ndarray, found: Identification, low: float, high: float)
         for frequency in frequencies[(frequencies >= low) & (frequencies <= high)]:
             ax.axvline(frequency, color=GREEN, linewidth=0.8, linestyle=(0, (1, 2)))
         if found.response.band is not None:
-            first, last = (float(x) for x in found.response.band)
+            first, last = np.asarray(found.response.band).tolist()
             for start, end in ((low, first), (last, high)):
                 if end > start:
                     ax.axvspan(start, end, color=GRID, alpha=0.6, linewidth=0, zorder=0)
