@@ -64,7 +64,7 @@ def profile(
     mark = np.arange(len(best)) == which
     ends = (known.lower / scale)[which], (known.upper / scale)[which]
     least = _squares(known, fit, best)
-    told = np.isfinite(covariance[which, which]) and covariance[which, which] > 0
+    told = np.isfinite(covariance[which, which]) and covariance[which, which] > 0 and not fit.at_bound[which]
     usual = float(np.sqrt(covariance[which, which])) if told else UNTOLD
     along = covariance[:, which] / covariance[which, which] if told else np.zeros(len(best))
     along = np.where(mark, 1.0, along)
@@ -76,8 +76,9 @@ def profile(
             values = values[np.concatenate([[True], np.diff(values) != 0]) & (values != best[which])]
             if not values.size:
                 break
-            starts = best + (values - best[which])[:, None] * along
-            squares = np.array([_held(terms, known, mark, start) for start in starts])
+            squares, at = np.full(len(values), np.inf), best
+            for i, value in enumerate(values):
+                squares[i], at = _held(terms, known, mark, at + (value - at[which]) * along)
             rise = np.where(np.isfinite(squares), squares - least, np.inf) / max(misfit, 1.0)
             if rise.max() > LIMIT or values[-1] in ends:
                 return values, rise
@@ -95,8 +96,8 @@ def profile(
 
 def _held(
     terms: tuple[Data, ...], known: Restricted, mark: Bool[np.ndarray, " p"], start: np.ndarray
-) -> float:
-    """-2 log posterior with the marked unknown held where the start has it, the others fitted from there."""
+) -> tuple[float, np.ndarray]:
+    """-2 log posterior with the marked unknown held where the start has it, the others fitted from there; the fit."""
     others = known._replace(
         unknowns=known.unknowns.held(mark, start * np.asarray(known.unknowns.scale)),
         prior=Prior(known.prior.mean, np.where(mark, 0.0, np.asarray(known.prior.weight))),
@@ -106,8 +107,10 @@ def _held(
     try:
         fit = within_bounds(terms, others, as_array(start))
     except InputError:  # no positive matrix has this value
-        return np.inf
-    return _squares(known, fit, np.where(mark, start, np.asarray(fit.posterior.theta)))
+        return np.inf, start
+    found = np.where(mark, start, np.asarray(fit.posterior.theta))
+    squares = _squares(known, fit, found)
+    return squares, found if np.isfinite(squares) else start
 
 
 def _squares(known: Restricted, fit: BoundedFit, at: np.ndarray) -> float:

@@ -1,6 +1,7 @@
 """What every refinement does, whatever the data: fit from several starts, covariance, validation, warnings."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -97,7 +98,7 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
             continue
         if squares < least:
             best, least = fit, squares
-        if problem.weighed and squares < GOOD * float(fit.posterior.equations):
+        if problem.weighed and _good(squares, float(fit.posterior.equations)):
             break
     if best is None:
         bad_input(
@@ -108,6 +109,11 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     if problem.train is None:
         return best, None
     return within_bounds(problem.every, known, best.posterior.theta, problem.solver), best
+
+
+def _good(squares: float, equations: float) -> bool:
+    """Whether a misfit leaves nothing to look for: a tenth above the noise, or what chance gives to few data."""
+    return squares < min(GOOD, 1 + max(0.1, 3 * math.sqrt(2 / max(equations, 1.0)))) * equations
 
 
 def _silent(known: Restricted, fit: BoundedFit) -> list[str]:

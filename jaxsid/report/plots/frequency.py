@@ -58,7 +58,11 @@ def frequency_range(found: Identification, fit: FrequencyFit) -> tuple[float, fl
         2 * np.pi
     )
     fastest, slowest = (float(np.max(x, initial=0.0)) for x in (frequencies, frequencies[:1]))
-    low = slowest / 4 if found.response.band is None else min(slowest / 4, float(np.asarray(found.response.band)[0]))
+    low = (
+        slowest / 4
+        if found.response.band is None
+        else min(slowest / 4, float(np.asarray(found.response.band)[0]))
+    )
     high = 4 * fastest if found.response.band is None else 1.1 * float(np.asarray(found.response.band)[1])
     high = min(max(high, 1.3 * fastest), positive[-1])
     return float(max(low, positive[0])), float(max(high, positive[min(10, len(positive) - 1)]))
