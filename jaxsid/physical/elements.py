@@ -88,7 +88,7 @@ class LinearMatrices(eqx.Module):
 
     def values(self, theta: Array) -> Float[Array, " e"]:
         """Of all elements, SI units."""
-        return self.base + self.mix @ (theta * self.scale)
+        return jnp.asarray(self.base) + self.mix @ (theta * self.scale)
 
     def unknowns(self, matrices: Triple) -> Array:
         """Those of least squares."""

@@ -44,7 +44,7 @@ def fit_elements(
     signed = np.array([model.matrices is None and x.quantity != "mass" for x in unknowns.listed])
     for _ in unknowns.listed:
         fit = fit_matrices(target, unknowns, start, sensed)
-        values = np.asarray(unknowns.values(np.asarray(fit.unknowns)))
+        values = np.asarray(unknowns.values(fit.unknowns))
         if not (np.isfinite(fit.misfit) and _possible(fit.matrices[0])):
             return None
         negative = signed & (values < 0)
