@@ -1,8 +1,11 @@
 """The first half of a diagnosis: is the gap real, how large is it, and where does it arise."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from jaxsid.checks import require
 from jaxsid.gap.locate import Locations, locate
@@ -10,12 +13,27 @@ from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
 from jaxsid.gap.null import Null, null_test, tolerance_test
 from jaxsid.gap.places import places_of
-from jaxsid.gap.recalibrate import as_given, recalibrated
+from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
+from jaxsid.gap.spectra import in_time
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.records import Record
+from jaxsid.physical.elements import ElementValues, element_matrices
+from jaxsid.records import Record, as_array
 
 SIGNIFICANT = 0.01  # probability by chance from which on nothing is claimed
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
+
+
+class Beside(NamedTuple):
+    """One record beside two models, each from the initial state that suits it best.
+
+    Attributes:
+        measured: (samples, outputs) of the model's sensors; NaN for those that the record lacks.
+        nominal, refit: (samples, outputs) responses of the nominal and of the refitted model.
+    """
+
+    measured: Float[np.ndarray, "samples outputs"]
+    nominal: Float[np.ndarray, "samples outputs"]
+    refit: Float[np.ndarray, "samples outputs"]
 
 
 class Examination(NamedTuple):
@@ -31,6 +49,8 @@ class Examination(NamedTuple):
         refit: that model.
         locations: where the effect acts; None where the structure is not in doubt.
         noises: of each record.
+        elements: values of the refitted model, their deviations, and the nominal ones.
+        beside: each record with both models' responses.
     """
 
     finding: str
@@ -42,6 +62,8 @@ class Examination(NamedTuple):
     refit: LumpedModel
     locations: Locations | None
     noises: tuple[Noise, ...]
+    elements: ElementValues
+    beside: tuple[Beside, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """The parts `gap` and `locations` of diagnosis.json."""
@@ -73,7 +95,9 @@ class Examination(NamedTuple):
         return {"gap": gap, "locations": locations}
 
 
-def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examination:
+def examine(
+    model: LumpedModel, records: Record | Sequence[Record], *, progress: Callable[[str], None] | None = None
+) -> Examination:
     """Whether records part from a model, how far, and where that arises.
 
     Two questions are asked: could the model within its tolerance have given the records, and could any linear model of
@@ -82,6 +106,7 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
     Args:
         model: nominal; its effects are left out.
         records: one or several, each with some of the model's sensors.
+        progress: called with a line of text as each stage begins.
 
     Returns:
         Examination.
@@ -91,9 +116,12 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(len(records) > 0, "give at least one record.")
+    say = progress or (lambda text: None)
+    say("noise, and the best linear model")
     guessed = noise_of(model, records)
     freely = recalibrated(model, records, guessed, wide=True)
     within = recalibrated(model, records, freely.noises, wide=False, given=True)
+    say("is the gap real")
     places = places_of(model)
     null, near = null_test(freely, places), null_test(within, places)
     drawn = tolerance_test(within, freely)
@@ -105,14 +133,42 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
     noises = guessed if structural else freely.noises
     nothing = as_given(model, records, noises)
     after = as_given(freely.model, records, noises)
+    say("how large it is")
+    gaps = gap_of(nothing, records), gap_of(after, records)
+    if structural:
+        say("where it arises")
     return Examination(
         finding="structure" if structural else "parameters" if off else "agreement",
         nominal_p_value=nominal,
         structural_p_value=null.p_value,
         null=null,
-        before=gap_of(nothing, records),
-        recalibrated=gap_of(after, records),
+        before=gaps[0],
+        recalibrated=gaps[1],
         refit=freely.model,
         locations=locate(model, records, noises=noises) if structural else None,
         noises=noises,
+        elements=_values(model, freely),
+        beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
     )
+
+
+def _values(model: LumpedModel, fit: Recalibrated) -> ElementValues:
+    """Of the refitted elements; those that cannot vary have no deviation."""
+    elements = element_matrices(model)
+    nominal = np.asarray(elements.nominal)
+    root = np.sqrt(np.diag(fit.covariance))
+    return ElementValues(
+        elements.listed,
+        as_array(nominal * (1 + fit.change)),
+        as_array(np.abs(nominal) * root),
+        as_array(fit.covariance / root / root[:, None]),
+        as_array(nominal),
+    )
+
+
+def _beside(nominal: Recalibrated, refit: Recalibrated, number: int) -> Beside:
+    spectra = nominal.settings[number].spectra
+    y = np.asarray(in_time(spectra, spectra.y))
+    left = (np.asarray(in_time(x.settings[number].spectra, x.linear[number].left)) for x in (nominal, refit))
+    y = np.where(np.asarray(spectra.present) > 0, y, np.nan)
+    return Beside(y, *(y - x for x in left))

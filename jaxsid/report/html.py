@@ -1,10 +1,11 @@
-"""The report of an identification: one HTML file that needs nothing else."""
+"""Reports: one HTML file each that needs nothing else."""
 
 from importlib.util import find_spec
 from pathlib import Path
 
 from jaxsid.checks import require
 from jaxsid.files.atomic import write_atomically
+from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.identification import Identification
 
 
@@ -22,6 +23,15 @@ def write_report(found: Identification, path: Path | str) -> None:
     from jaxsid.report.identification_page import report_page  # slow to load
 
     text = report_page(found)
+    write_atomically(path, lambda stream: stream.write(text))
+
+
+def write_diagnosis_report(found: Diagnosis, path: Path | str) -> None:
+    """The same of a diagnosis; arguments and errors as of `write_report`."""
+    check_installed("matplotlib", "jinja2")
+    from jaxsid.report.diagnosis_page import diagnosis_page  # slow to load
+
+    text = diagnosis_page(found)
     write_atomically(path, lambda stream: stream.write(text))
 
 

@@ -5,6 +5,7 @@ import math
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BEYOND = 100.0  # misfit that says no more than that a model moves by itself
 MISSING = "\N{EN DASH}"
+DASH = " \N{EN DASH} "
 TIMES = " \N{MULTIPLICATION SIGN} "
 
 
