@@ -19,7 +19,9 @@ from jaxsid.gap.signals import LINEAR, MOST, Extent
 from jaxsid.gap.spectra import Motion, motion_under
 from jaxsid.mechanics.lumped import LumpedModel
 
-STEP = 4.0  # from one rate of the processes to the next, from the slowest vibration up to half the sampling rate
+STEP = (
+    4.0  # from one rate of the processes to the next, from the slowest vibration up to half the sampling rate
+)
 MOST_RATES = 7
 SIZES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # next to a least-squares force
 REMAINDERS = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 1.0)  # what shapes leave of a force, next to its rms
