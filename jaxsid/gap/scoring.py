@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsid.gap.apart import Hypotheses
 from jaxsid.gap.evidence import Force, evidence
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Chosen, Explained, Guess, Ports, explained, extents, ports_of, tables
@@ -38,6 +39,7 @@ class Scores(NamedTuple):
         linear: (places,) of delays and lags alone, where the place is a signal.
         process_force: (places,) the process that explains most.
         explained: for each record what the shapes make of it, a row a place.
+        tried: the hypotheses behind it.
     """
 
     process: np.ndarray
@@ -45,6 +47,7 @@ class Scores(NamedTuple):
     linear: np.ndarray
     process_force: Force
     explained: tuple[Explained, ...]
+    tried: Hypotheses
 
     @property
     def best(self) -> np.ndarray:
@@ -57,6 +60,7 @@ class _Round(NamedTuple):
     value: np.ndarray
     force: Force
     explained: tuple[Explained, ...]
+    tried: Hypotheses
 
 
 def scores(
@@ -83,7 +87,7 @@ def scores(
         motions = [x.motion for x in latest.explained]
         latest = _round(settings, ports, motions, force, _shape_priors(tolerance, size))
     shaped, linear = latest.value[:, : len(SLABS)].max(axis=1), latest.value[:, len(SLABS)]
-    return Scores(first.value[:, 0], shaped, linear, first.force, latest.explained)
+    return Scores(first.value[:, 0], shaped, linear, first.force, latest.explained, latest.tried)
 
 
 def _nominal_motion(given: Setting) -> Motion:
@@ -113,7 +117,7 @@ def _round(
     process = Force(*(x[rows, at % width] for x in force))
     chosen = Chosen(process, jnp.asarray(found.coefficients[rows, at // width, at % width]))
     made = tuple(explained(s, ports, g, chosen) for s, g in zip(settings, guesses, strict=True))
-    return _Round(found.value.max(axis=2), process, made)
+    return _Round(found.value.max(axis=2), process, made, Hypotheses(ports, tuple(guesses), force, priors))
 
 
 def together(sizes: list[Extent]) -> Extent:
