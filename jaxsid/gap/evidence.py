@@ -111,6 +111,23 @@ def _without_transients(gram: Array, log_determinant: Array, count: int) -> Tabl
     )
 
 
+def absorbed(
+    transfer: Complex[Array, "lines outputs"],
+    scale: Float[Array, "lines outputs"],
+    density: Float[Array, "h lines"],
+) -> Float[Array, " h"]:
+    """What noise alone adds to the evidence of each process, on average: the part of it that the process takes up.
+
+    Args:
+        transfer: from the force.
+        scale: as of `table`.
+        density: of the force.
+    """
+    square = (jnp.abs(transfer * scale) ** 2).sum(axis=1)
+    weight = (scale > 0).any(axis=1) * 1.0
+    return (weight * density * square / (1 + density * square)).sum(axis=1)
+
+
 def evidence(tables: Table, prior: Float[np.ndarray, "*shape k"]) -> Evidence:
     """Of each hypothesis, from the tables of all records, added up; with numpy, since the tables are small.
 

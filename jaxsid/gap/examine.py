@@ -88,6 +88,7 @@ class Examination(NamedTuple):
                 "place": x.place.as_dict(),
                 "probability": x.probability,
                 "told_apart": self.locations is not None and x.place not in self.locations.likely,
+                "together": [p.as_dict() for p in x.together],
                 "across": None if math.isnan(x.across) else x.across,
             }
             for x in found

@@ -97,13 +97,30 @@ def _smoothed(
 ) -> tuple[Float[Array, "samples 3"], Array]:
     """Force, displacement and velocity; the force's standard deviation."""
     transfer = spectra.forced @ joint + sensor
-    y = in_time(spectra, made.left + transfer * made.force[:, None])
-    moved = (spectra.forced_states @ joint) * made.force[:, None]
-    rates = jnp.stack([made.force, 1j * spectra.omega * made.force], axis=1)
+    # a line on a pole tells nothing: left out here, and a free body's steady force is that of its balance
+    used = spectra.weight > 0
+    force = jnp.where(used, made.force, 0.0)
+    y = in_time(spectra, jnp.where(used[:, None], made.left + transfer * force[:, None], 0.0))
+    moved = (spectra.forced_states @ joint) * force[:, None]
+    rates = jnp.stack([force, 1j * spectra.omega * force], axis=1)
     start = jnp.concatenate([in_time(spectra, moved)[0], in_time(spectra, rates)[0]])
     latent = latent_model(*system, size, rate, level, spectra.dt)
     found = smooth(latent, y, start)
     q, v = jnp.split(in_time(spectra, made.motion.states), 2, axis=1)
     n = len(start) - 2
-    signals = jnp.stack([found.state[:, n], q @ joint, v @ joint], axis=1)
+    steady = jnp.where(used[0], 0.0, _steady_force(spectra, made, joint)) / np.sqrt(spectra.samples)
+    signals = jnp.stack([found.state[:, n] + steady, q @ joint, v @ joint], axis=1)
     return signals, jnp.sqrt(jnp.maximum(found.covariance[n, n], 0.0))
+
+
+def _steady_force(spectra: Spectra, made: Explained, joint: Array) -> Array:
+    """Line 0 of a force that acts on free bodies, from the balance of impulses; the shapes' own where it does not."""
+    linear, motion = spectra.linear, made.motion
+    v = motion.states[0, len(joint) :].real
+    missing = linear.mass @ motion.accelerations[0].real + linear.damping @ v
+    missing = missing - linear.input_matrix @ spectra.u[0].real
+    along = joint - linear.stiffness @ (spectra.flexibility @ joint)
+    square = along @ joint
+    balanced = square > 1e-9 * (joint @ joint)
+    found = along @ missing / jnp.where(balanced, square, 1.0)
+    return jnp.where(balanced, found, made.force[0].real)

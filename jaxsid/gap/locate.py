@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxsid.checks import require
+from jaxsid.gap.apart import COMPARED, expected_differences, same_force, sets_of
 from jaxsid.gap.force_map import ForceMap, force_map
 from jaxsid.gap.noise import Noise, deviations, noise_of
 from jaxsid.gap.places import Place, places_of
@@ -18,7 +20,7 @@ from jaxsid.records import Record
 
 # Raw evidence is overconfident, for what no basis of shapes holds decides, not noise: it is divided by this.
 TEMPERATURE = 100.0
-LIKELY = 0.05  # of the probability of the first: what is not told apart from it
+SAME = 3.0  # tempered difference of logarithms of evidence, found or expected, below which places are not told apart
 MOST_MAPS = 3  # places of which the force is reported
 UNEXPLAINED = (
     2.0  # mean square, in noise, across a place's transfer, from which on no force there explains the records
@@ -34,12 +36,14 @@ class Location(NamedTuple):
         evidence: its logarithm, less that of the first.
         across: mean square, in noise, of what no force at this place could explain; about 1 at the right one, NaN
             where one sensor leaves nothing to judge by.
+        together: the places that these records cannot tell apart from it, with it, most probable first.
     """
 
     place: Place
     probability: float
     evidence: float
     across: float
+    together: tuple[Place, ...]
 
 
 class Locations(NamedTuple):
@@ -47,7 +51,7 @@ class Locations(NamedTuple):
 
     Attributes:
         ranked: every place, most probable first.
-        likely: those that these records do not tell apart from the first, with it.
+        likely: the set of the first.
         maps: the force over time at the most probable of them, one a record.
         noises: of each record.
         remarks: what is to be known about it.
@@ -119,21 +123,52 @@ def _concluded(
     found: Scores,
 ) -> Locations:
     value = _with_ties(found, places)
-    probability = np.exp((value - value.max()) / TEMPERATURE)
-    probability = probability / probability.sum()
+    order = [int(i) for i in np.argsort(-value, kind="stable")]
+    same, alike = same_force(model, places), _alike(settings, found, value, order)
+    sets = sets_of(order, alike | same)
+    probability = _shared(value, sets, alike)
     across = _across(settings, found)
-    order = np.argsort(-value, kind="stable")
     ranked = tuple(
-        Location(places[i], float(probability[i]), float(value[i] - value.max()), float(across[i]))
+        Location(
+            places[i],
+            float(probability[i]),
+            float(value[i] - value.max()),
+            float(across[i]),
+            tuple(places[j] for j in sets[i]),
+        )
         for i in order
     )
-    likely = [int(i) for i in order if probability[i] >= LIKELY * probability.max()]
+    likely = sets[order[0]]
     maps = tuple(
         force_map(model, places[i], setting, made, i, found.process_force, noise, number)
         for i in likely[:MOST_MAPS]
         for number, (setting, made, noise) in enumerate(zip(settings, found.explained, noises, strict=True))
     )
     return Locations(ranked, tuple(places[i] for i in likely), maps, noises, _remarks(across, likely, places))
+
+
+def _alike(
+    settings: Sequence[Setting], found: Scores, value: np.ndarray, order: Sequence[int]
+) -> Bool[np.ndarray, "places places"]:
+    """[a, b]: whether b explains these records nearly as well as a, or would explain what a leaves in them."""
+    limit = SAME * TEMPERATURE
+    alike = np.abs(value[:, None] - value) < limit
+    rows = np.array(order[:COMPARED])
+    expected = expected_differences(settings, found.tried, found.explained, rows)
+    alike[np.ix_(rows, rows)] |= expected < limit
+    return alike
+
+
+def _shared(
+    value: np.ndarray, sets: Sequence[tuple[int, ...]], alike: Bool[np.ndarray, "places places"]
+) -> np.ndarray:
+    """Probabilities, of which those of a set that cannot be told apart take equal parts."""
+    each = np.exp((value - value.max()) / TEMPERATURE)
+    each = each / each.sum()
+    for members in set(sets):
+        equal = [i for i in members if i == members[0] or alike[members[0], i]]
+        each[equal] = each[equal].mean()
+    return each
 
 
 def _with_ties(found: Scores, places: tuple[Place, ...]) -> np.ndarray:

@@ -92,20 +92,32 @@ def ports_of(model: LumpedModel, places: tuple[Place, ...]) -> Ports:
     return Ports(kind, *(jnp.asarray(np.array(x).reshape(len(places), -1), float) for x in rows))
 
 
-def _transfers(spectra: Spectra, port: Ports) -> tuple[Array, Array]:
-    """From a process at the place, and from its shapes: the latter pass through the hold where they are inputs."""
+def transfers_of(spectra: Spectra, port: Ports) -> tuple[Array, Array]:
+    """From a process at a place, and from its shapes: the latter pass through the hold where they are inputs.
+
+    Args:
+        spectra: of the record.
+        port: the place.
+    """
     plain = spectra.forced @ port.joint + port.sensor
     return plain, jnp.where(port.kind == 2, spectra.driven @ port.drive, plain)
 
 
-def _columns(given: Setting, port: Ports, motion: Motion, size: Extent | None) -> Array:
-    """(lines, outputs, e + k): elements, then shapes of the place, none without its extents."""
+def columns_of(given: Setting, port: Ports, motion: Motion, size: Extent | None) -> Array:
+    """(lines, outputs, e + k): elements, then shapes of a place, none without its extents.
+
+    Args:
+        given: record and model.
+        port: the place.
+        motion: that both are evaluated on.
+        size: extents of the place's signals.
+    """
     spectra = given.spectra
     elements = parameter_columns(spectra, motion, given.directions)
     if size is None:
         return elements
     pair = signals(port.kind, spectra, motion, port.joint, port.sensor, port.drive)
-    held = _transfers(spectra, port)[1]
+    held = transfers_of(spectra, port)[1]
     shaped = held[:, :, None] * shapes(port.kind, spectra, pair, size, given.rate)[:, None, :]
     return jnp.concatenate([elements, shaped], axis=2)
 
@@ -125,8 +137,8 @@ def tables(given: Setting, ports: Ports, guess: Guess, force: Force) -> Table:
 
     def one(row: tuple[Ports, Guess, Force]) -> Table:
         port, guess, force = row
-        columns = jnp.concatenate([_columns(given, port, guess.motion, guess.size), left], axis=2)
-        plain, _ = _transfers(spectra, port)
+        columns = jnp.concatenate([columns_of(given, port, guess.motion, guess.size), left], axis=2)
+        plain, _ = transfers_of(spectra, port)
         densities = density(force, spectra.omega, spectra.dt)
         return table(columns, spectra.free, plain, given.scale, densities, given.transient)
 
@@ -160,9 +172,9 @@ def explained(given: Setting, ports: Ports, guess: Guess, chosen: Chosen) -> Exp
 
 def _explained(given: Setting, port: Ports, guess: Guess, chosen: Chosen) -> Explained:
     spectra, elements = given.spectra, len(given.directions[0])
-    columns = _columns(given, port, guess.motion, guess.size)
+    columns = columns_of(given, port, guess.motion, guess.size)
     rest = spectra.y - spectra.response - columns @ chosen.coefficients
-    plain, _ = _transfers(spectra, port)
+    plain, _ = transfers_of(spectra, port)
     one = Force(*(x[None] for x in chosen.force))
     variance = density(one, spectra.omega, spectra.dt)[0]
     transient, rest = _cleared(given, plain, variance, rest)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxsid.gap.apart import Hypotheses
 from jaxsid.gap.evidence import Force, evidence
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Chosen, Explained, Guess, Ports, explained, extents, ports_of, tables
@@ -20,7 +20,10 @@ from jaxsid.gap.signals import LINEAR, MOST, Extent
 from jaxsid.gap.spectra import Motion, motion_under
 from jaxsid.mechanics.lumped import LumpedModel
 
-RATES = (1.0, 4.0, 16.0)  # of the processes, next to the slowest vibration
+STEP = (
+    4.0  # from one rate of the processes to the next, from the slowest vibration up to half the sampling rate
+)
+MOST_RATES = 7
 SIZES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # next to a least-squares force
 REMAINDERS = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 1.0)  # what shapes leave of a force, next to its rms
 SLABS = (1.0, 10.0)  # coefficients of shapes, next to the force's rms
@@ -36,6 +39,7 @@ class Scores(NamedTuple):
         linear: (places,) of delays and lags alone, where the place is a signal.
         process_force: (places,) the process that explains most.
         explained: for each record what the shapes make of it, a row a place.
+        tried: the hypotheses behind it.
     """
 
     process: np.ndarray
@@ -43,6 +47,7 @@ class Scores(NamedTuple):
     linear: np.ndarray
     process_force: Force
     explained: tuple[Explained, ...]
+    tried: Hypotheses
 
     @property
     def best(self) -> np.ndarray:
@@ -55,6 +60,7 @@ class _Round(NamedTuple):
     value: np.ndarray
     force: Force
     explained: tuple[Explained, ...]
+    tried: Hypotheses
 
 
 def scores(
@@ -71,16 +77,17 @@ def scores(
     ports, count = ports_of(model, places), len(places)
     motions = [_spread(_nominal_motion(s), count) for s in settings]
     scale = np.max([_force_scale(s, ports) for s in settings], axis=0)
+    rates = _rates(settings)
     alone = np.tile(tolerance, (count, 1, 1))
-    first = _round(settings, ports, motions, _grid(scale, SIZES, settings[0].rate), alone)
+    first = _round(settings, ports, motions, _grid(scale, SIZES, rates), alone)
     latest = first
     for _ in range(ROUNDS):
         size = _rms_force(settings, latest.explained)
-        force = _grid(size, REMAINDERS, settings[0].rate)
+        force = _grid(size, REMAINDERS, rates)
         motions = [x.motion for x in latest.explained]
         latest = _round(settings, ports, motions, force, _shape_priors(tolerance, size))
     shaped, linear = latest.value[:, : len(SLABS)].max(axis=1), latest.value[:, len(SLABS)]
-    return Scores(first.value[:, 0], shaped, linear, first.force, latest.explained)
+    return Scores(first.value[:, 0], shaped, linear, first.force, latest.explained, latest.tried)
 
 
 def _nominal_motion(given: Setting) -> Motion:
@@ -110,7 +117,7 @@ def _round(
     process = Force(*(x[rows, at % width] for x in force))
     chosen = Chosen(process, jnp.asarray(found.coefficients[rows, at // width, at % width]))
     made = tuple(explained(s, ports, g, chosen) for s, g in zip(settings, guesses, strict=True))
-    return _Round(found.value.max(axis=2), process, made)
+    return _Round(found.value.max(axis=2), process, made, Hypotheses(ports, tuple(guesses), force, priors))
 
 
 def together(sizes: list[Extent]) -> Extent:
@@ -123,9 +130,17 @@ def together(sizes: list[Extent]) -> Extent:
     return Extent(most, jnp.sqrt((jnp.stack([x.rms for x in sizes]) ** 2).mean(axis=0)))
 
 
-def _grid(scale: np.ndarray, sizes: Sequence[float], rate: Array) -> Force:
-    size, speed = (x.ravel() for x in np.meshgrid(sizes, RATES))
-    return Force(jnp.asarray(scale[:, None] * size), jnp.broadcast_to(speed * rate, (len(scale), len(speed))))
+def _rates(settings: Sequence[Setting]) -> np.ndarray:
+    """Of the processes, 1/s: what shapes leave may be as quick as the samples show, however slow the model."""
+    slowest = float(settings[0].rate)
+    quickest = max(np.pi / float(s.spectra.dt) for s in settings)
+    count = int(np.log(max(quickest / slowest, 1.0)) / np.log(STEP)) + 1
+    return slowest * STEP ** np.arange(min(count, MOST_RATES))
+
+
+def _grid(scale: np.ndarray, sizes: Sequence[float], rates: np.ndarray) -> Force:
+    size, speed = (x.ravel() for x in np.meshgrid(sizes, rates))
+    return Force(jnp.asarray(scale[:, None] * size), jnp.broadcast_to(speed, (len(scale), len(speed))))
 
 
 def _shape_priors(tolerance: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from jaxsid.mechanics.simulate import measured_sensors, ordered_inputs
 from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderModel
 
 FEWEST = 64  # samples of a record
+FREE = 1e-9  # stiffness of a motion, next to the largest, below which nothing holds it
 CLEAR = 1e-9  # distance of a line from a pole, on the circle of z, from which on it is used
 
 
@@ -45,6 +46,7 @@ class Spectra(eqx.Module):
         driven_states: (lines, 2 N, inputs) likewise to the states.
         linear: M, D, K, where forces act and what sensors read.
         inverse_mass: (N, N).
+        flexibility: (N, N) pseudo-inverse of the stiffness.
         dt: sampling interval, s.
         samples: of the record.
     """
@@ -62,6 +64,7 @@ class Spectra(eqx.Module):
     driven_states: Complex[Array, "lines n inputs"]
     linear: SecondOrderModel
     inverse_mass: Float[Array, "N N"]
+    flexibility: Float[Array, "N N"]
     dt: Float[Array, ""]
     samples: int = eqx.field(static=True)
 
@@ -121,6 +124,7 @@ class _Sampled(NamedTuple):
     plain: ContinuousModel
     states: Realization
     inverse_mass: Array
+    flexibility: Array
     poles: Array
     band: bool
 
@@ -136,7 +140,8 @@ def _sampled_model(model: LumpedModel, dt: Array, hold: tuple[str, ...]) -> _Sam
     sampled = tuple("zero" if h == "band" else h for h in hold)
     states = discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=sampled)
     poles = jnp.asarray(np.linalg.eigvals(np.asarray(states.A)))
-    return _Sampled(linear, plain, states, plain.B[size:], poles, "band" in hold)
+    flexibility = jnp.asarray(np.linalg.pinv(np.asarray(linear.stiffness), rcond=FREE, hermitian=True))
+    return _Sampled(linear, plain, states, plain.B[size:], flexibility, poles, "band" in hold)
 
 
 @compiled
@@ -170,6 +175,7 @@ def _spectra(u: Array, y: Array, present: Array, model: _Sampled) -> Spectra:
         driven_states,
         model.linear,
         model.inverse_mass,
+        model.flexibility,
         states.dt,
         samples,
     )
@@ -218,8 +224,23 @@ def motion_under(
         states + spectra.free_states @ transient + jnp.einsum("lnf,lf->ln", spectra.forced_states, forces)
     )
     q, v = jnp.split(states, 2, axis=1)
-    pushed = forces + spectra.u @ linear.input_matrix.T - q @ linear.stiffness.T - v @ linear.damping.T
-    return Motion(states, pushed @ spectra.inverse_mass.T)
+    given = forces + spectra.u @ linear.input_matrix.T
+    pushed = given - q @ linear.stiffness.T - v @ linear.damping.T
+    accelerations = pushed @ spectra.inverse_mass.T
+    steady_states, steady_accelerations = _steady(spectra, given[0], transient)
+    free = spectra.weight[0] == 0
+    return Motion(
+        states.at[0].set(jnp.where(free, steady_states, states[0])),
+        accelerations.at[0].set(jnp.where(free, steady_accelerations, accelerations[0])),
+    )
+
+
+def _steady(spectra: Spectra, given: Array, transient: Array) -> tuple[Array, Array]:
+    """Means of states, about a middle at zero, and of accelerations of free bodies: from how far their state went."""
+    linear, duration = spectra.linear, spectra.dt * np.sqrt(spectra.samples)
+    v, a = jnp.split(-transient / duration, 2)
+    q = spectra.flexibility @ (given - linear.damping @ v - linear.mass @ a)
+    return jnp.concatenate([q, v + 0 * q]), a + 0 * q
 
 
 def readings(spectra: Spectra, motion: Motion) -> Complex[Array, "lines outputs"]:
