@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from jaxsid.files.model_toml import write_model as write_model
     from jaxsid.files.record_file import read_record as read_record
     from jaxsid.files.record_file import read_records as read_records
+    from jaxsid.gap.diagnose import Diagnosis as Diagnosis
+    from jaxsid.gap.diagnose import diagnose as diagnose
     from jaxsid.identification import Identification as Identification
     from jaxsid.impulse.direct import Direct as Direct
     from jaxsid.impulse.ensemble import WaveletEnsemble as WaveletEnsemble
@@ -74,6 +76,7 @@ _HOMES = {
     "jaxsid.compilation": ("keep_programs",),
     "jaxsid.files.model_toml": ("read_model", "write_model"),
     "jaxsid.files.record_file": ("read_record", "read_records"),
+    "jaxsid.gap.diagnose": ("Diagnosis", "diagnose"),
     "jaxsid.identification": ("Identification",),
     "jaxsid.pipeline.identify": ("identify",),
     "jaxsid.pipeline.refine": ("refine",),

@@ -136,6 +136,36 @@ def identify(
 
 
 @app.command()
+def diagnose(
+    model: ModelFile,
+    records: RecordFiles,
+    out: Annotated[
+        Path, typer.Option(help="Folder for diagnosis.json, model.toml, forces.npz and report.html.")
+    ],
+    initial: Annotated[
+        Initial, typer.Option(help="Initial state of each record; rest warns where it is not.")
+    ] = Initial.estimate,
+    quiet: Quiet = False,
+) -> None:
+    """Where the model and the records part: is it noise, how large is it, and at which place does it arise."""
+    with _errors(), _progress(quiet) as say:
+        say("loading")
+        _numerics()
+        from jaxsid.files.model_toml import read_model
+        from jaxsid.files.record_file import read_records
+        from jaxsid.gap.diagnose import diagnose as run
+
+        nominal = read_model(model)
+        found = run(nominal, read_records(records, nominal), initial=initial.value, progress=say)
+        _write_diagnosis(found, out, say)
+    if not quiet:
+        from jaxsid.report.diagnosis_summary import print_diagnosis
+
+        print_diagnosis(found)
+        typer.echo(f"\nWritten to {out}: diagnosis.json, model.toml, forces.npz, report.html")
+
+
+@app.command()
 def simulate(
     model: ModelFile,
     record: Annotated[
@@ -344,6 +374,26 @@ def _write(found, out: Path, say) -> None:
                 found.identified, draft / "model.toml", header="Identified by jaxsid from measured records."
             )
         write_report(found, draft / "report.html")
+
+
+def _write_diagnosis(found, out: Path, say) -> None:
+    """All files, or none."""
+    from jaxsid.files.atomic import atomic_directory
+    from jaxsid.files.model_toml import write_model
+    from jaxsid.files.results_json import write_json
+    from jaxsid.report.force_file import write_forces
+    from jaxsid.report.html import write_diagnosis_report
+
+    say("report")
+    with atomic_directory(out) as draft:
+        write_json(draft / "diagnosis.json", found.as_dict())
+        write_model(
+            found.examination.refit,
+            draft / "model.toml",
+            header="Numbers refitted by jaxsid to measured records.",
+        )
+        write_forces(found, draft / "forces.npz")
+        write_diagnosis_report(found, draft / "report.html")
 
 
 def _summary(found, out: Path) -> None:

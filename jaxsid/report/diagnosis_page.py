@@ -55,7 +55,7 @@ SAID = {
     ),
     "structure": (
         "The model lacks something.",
-        "No numbers of its masses, springs and dampers explain these records: a law that it does not have acts.",
+        "No numbers of its masses, springs and dampers explain these records.",
     ),
 }
 REFERENCES = (
@@ -130,7 +130,7 @@ def _findings(found: Diagnosis) -> Section:
         first = seen.locations.ranked[0]
         share = sum(x.probability for x in seen.locations.ranked if x.place in seen.locations.likely)
         others = len(seen.locations.likely) - 1
-        remark = f"probability {_share(share)}" + (
+        remark = f"probability {share_of(share)}" + (
             f", with {plural(others, 'other')} not told apart" if others else ""
         )
         cards.append(Card("Where", label_of(first.place), remark))
@@ -142,13 +142,20 @@ def _findings(found: Diagnosis) -> Section:
     return Section("Findings", tuple(blocks))
 
 
-def _share(probability: float) -> str:
-    return "above 99 %" if probability > 0.99 else percent(probability)
+def share_of(probability: float) -> str:
+    """A probability in percent, without digits that it does not have.
+
+    Args:
+        probability: from 0 to 1.
+    """
+    if probability > 0.99:
+        return "above 99 %"
+    return percent(probability) if probability >= 0.001 else "below 0.1 %"
 
 
 def _gap(found: Diagnosis) -> Section:
     seen = found.examination
-    header = ("Sensor", "Nominal", "Refitted", "Noise alone", "Gap (noise = 1)", "Refitted")
+    header = ("Sensor", "Nominal", "Refitted", "Noise alone", "Gap (noise = 1)", "Refitted (noise = 1)")
     rows = tuple(
         (
             name,
@@ -163,9 +170,9 @@ def _gap(found: Diagnosis) -> Section:
     windows = "windows of one period of the slowest motion, since a free run drifts"
     how = windows if seen.before.windowed else "all records"
     note = (
-        f"NRMSE: rms of measured less modelled over the standard deviation of the measured signal, {how}, each from the "
-        "initial state that suits the model best. The gap in noise is what is left, made white, over the noise: 1 is "
-        f"noise alone. Noise from: {', '.join(dict.fromkeys(n.source for n in seen.noises))}."
+        f"NRMSE: rms of measured less modelled over the standard deviation of the measured signal, {how}, each "
+        "from the initial state that suits the model best. The gap in noise is what is left, made white, over the "
+        f"noise: 1 is noise alone. Noise from: {', '.join(dict.fromkeys(n.source for n in seen.noises))}."
     )
     pictures = [
         picture(
@@ -211,7 +218,7 @@ def _place_row(x: Location, first: bool) -> tuple[str | Cell, ...]:
     others = ", ".join(label_of(p) for p in x.together if p != x.place)
     return (
         label_of(x.place),
-        _share(x.probability) if x.probability >= 0.001 else "below 0.1 %",
+        share_of(x.probability),
         "0" if first else significant(x.evidence, 3),
         Cell(MISSING if np.isnan(x.across) else significant(np.sqrt(x.across), 3)),
         Cell(others or MISSING, tone="wide"),
@@ -241,7 +248,7 @@ MEANING = (
     "gap or a stop, a loop hysteresis."
 )
 MAP = minus(
-    "Grey: samples; blue: their mean. F acts as -F on the second end and as +F on the first: a spring rises to the right."
+    "Grey: samples; blue: their mean. F acts as -F on the second end and as +F on the first: springs rise to the right."
 )
 
 
@@ -285,8 +292,8 @@ def _method(found: Diagnosis) -> Section:
     seen = found.examination
     tests = sorted(seen.null.tests, key=lambda x: x.p_value)[:TESTS]
     note = (
-        f"Nothing is claimed unless chance would give it less than once in {1 / SIGNIFICANT:.0f} right models and it is "
-        f"above {percent(NEGLIGIBLE)} of the response. Nominal model within its tolerance: probability "
+        f"Nothing is claimed unless chance would give it less than once in {1 / SIGNIFICANT:.0f} right models and it "
+        f"is above {percent(NEGLIGIBLE)} of the response. Nominal model within its tolerance: probability "
         f"{_p(seen.nominal_p_value)}; any numbers of its elements: {_p(seen.structural_p_value)}."
     )
     table = Table(

@@ -23,32 +23,38 @@ def print_summary(found: Identification, console: Console | None = None) -> None
         f"\n[bold]{escape(found.nominal.name)}[/]: order {found.order}. {escape(found.order_reason)}"
     )
     console.print(_modes(found))
-    for table in _matrices(found):
-        console.print(table)
+    for made in _matrices(found):
+        console.print(made)
     console.print(_fit(found))
     if found.warnings:
         text = "\n".join(f"• {escape(warning)}" for warning in found.warnings)
         console.print(Panel(text, title="Warnings", border_style="yellow", title_align="left"))
 
 
-def _table(title: str, *header: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", header_style="dim")
+def table(title: str, *header: str) -> Table:
+    """An empty table, numbers to the right.
+
+    Args:
+        title: over it.
+        header: of the columns.
+    """
+    made = Table(title=title, title_justify="left", title_style="bold", header_style="dim")
     for column, name in enumerate(header):
-        table.add_column(name, justify="right" if column else "left", overflow="fold")
-    return table
+        made.add_column(name, justify="right" if column else "left", overflow="fold")
+    return made
 
 
 def _modes(found: Identification) -> Table:
-    table = _table("Modes", "", "Hz", "change", "damping ratio (%)", "MAC", "EMAC", "MPC", "MSV")
+    made = table("Modes", "", "Hz", "change", "damping ratio (%)", "MAC", "EMAC", "MPC", "MSV")
     for number, mode in enumerate(modes_of(found), 1):
-        table.add_row(
+        made.add_row(
             f"{number}{' real' if mode.real else ''}",
             with_std(mode.frequency, mode.frequency_std),
             change(mode.frequency, mode.nominal_frequency),
             MISSING if mode.real else with_std(100 * mode.damping_ratio, 100 * mode.damping_ratio_std),
             *(significant(mode.indicators[name], 3) for name in ("mac", "emac", "mpc", "msv")),
         )
-    return table
+    return made
 
 
 def _matrices(found: Identification) -> list[Table]:
@@ -58,11 +64,11 @@ def _matrices(found: Identification) -> list[Table]:
     for which in MATRICES:
         values, old = (np.asarray(getattr(x, which)) for x in (found.matrices, nominal))
         std = None if found.matrices_std is None else np.asarray(getattr(found.matrices_std, which))
-        table = _table(f"{units.name(which).capitalize()} ({units.symbol(which)})", "", *found.nominal.bodies)
+        made = table(f"{units.name(which).capitalize()} ({units.symbol(which)})", "", *found.nominal.bodies)
         for i, body in enumerate(found.nominal.bodies):
-            table.add_row(body, *(_entry(values[i, j], None if std is None else std[i, j], old[i, j])
+            made.add_row(body, *(_entry(values[i, j], None if std is None else std[i, j], old[i, j])
                                   for j in range(len(values))))  # fmt: skip
-        tables.append(table)
+        tables.append(made)
     return tables
 
 
@@ -73,10 +79,10 @@ def _entry(value: float, std: float | None, nominal: float) -> str:
 
 def _fit(found: Identification) -> Table:
     models = compared(found)
-    table = _table(
+    made = table(
         "Fit (NRMSE)", "sensor", *(name.lower().replace("cbsi", "CBSI") for name, _ in models), "noise floor"
     )
     for i in worst_fits(found):
         floor = percent(float(found.noise_floor[i]))
-        table.add_row(escape(found.outputs[i]), *(misfit(float(values[i])) for _, values in models), floor)
-    return table
+        made.add_row(escape(found.outputs[i]), *(misfit(float(values[i])) for _, values in models), floor)
+    return made

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import StepPatch
 
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.report.envelope import envelope
@@ -188,7 +189,7 @@ def pairs(found: Diagnosis, most: int) -> Sequence[tuple[str, int]]:
 
 def _noise_axis(ax: Axes) -> None:
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in ax.lines] or [np.ones(1)])
-    stairs = [np.asarray(p.get_data().values, float) for p in ax.patches if hasattr(p, "get_data")]
+    stairs = [np.asarray(p.get_data()[0], float) for p in ax.patches if isinstance(p, StepPatch)]
     values = np.concatenate([values, *stairs])
     top = float(np.nanmax(values, initial=1.0))
     if top > 20:

@@ -1,0 +1,141 @@
+"""The diagnosis as a value, as JSON, as a page and as a command."""
+
+import json
+
+import numpy as np
+import pytest
+from gap_helpers import DT, JOINT, SAMPLES, chain, drive, exact, noisy, record, with_effect
+from typer.testing import CliRunner
+
+from jaxsid import Effect, InputError, diagnose, read_model, write_model
+from jaxsid.cli import app
+from jaxsid.files.results_json import plain
+from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model
+from jaxsid.report.diagnosis_page import diagnosis_page
+from jaxsid.report.diagnosis_summary import print_diagnosis
+from jaxsid.report.plots.places import map_figure
+
+
+@pytest.fixture(scope="module")
+def cubic():
+    u = drive()
+    y = noisy(with_effect(u, "cubic_stiffness", JOINT, {"coefficient": 1e6}))
+    said = []
+    found = diagnose(chain(), record(u, y, name="run-1.csv"), progress=said.append)
+    assert said[-1] == "where it arises"
+    return found
+
+
+def test_a_missing_law_is_unknown_with_its_place_and_force(cubic):
+    assert cubic.verdict == "unknown"
+    written = json.loads(json.dumps(plain(cubic.as_dict(), "diagnosis")))
+    assert written["locations"][0]["place"] == {"between": ["b1", "b2"]}
+    assert written["selected"] == []
+    (force,) = [x for x in written["forces"] if x["place"] == {"between": ["b1", "b2"]}]
+    assert force["rms"] > 3 * force["deviation"]
+    assert written["gap"]["p_value"] < 1e-6
+    assert "does not have" in written["remaining"]
+    assert written["next_experiment"]
+
+
+def test_the_force_is_that_of_the_law(cubic):
+    one = next(x for x in cubic.examination.locations.maps if x.place.ends == ("b1", "b2"))
+    law = -1e6 * one.displacement**3
+    inside = slice(SAMPLES // 10, -SAMPLES // 10)
+    assert np.corrcoef(one.force[inside], law[inside])[0, 1] > 0.97
+
+
+def test_the_responses_beside_the_record(cubic):
+    (beside,) = cubic.examination.beside
+    y = np.asarray(cubic.records[0].y)
+    np.testing.assert_allclose(beside.measured, y, atol=1e-9 * np.abs(y).max())
+    for name, response in (("before", beside.nominal), ("recalibrated", beside.refit)):
+        nrmse = np.sqrt(((y - response) ** 2).mean(axis=0)) / y.std(axis=0)
+        told = list(getattr(cubic.examination, name).nrmse.values())
+        np.testing.assert_allclose(nrmse, told, rtol=1e-6)
+
+
+def test_the_page(cubic):
+    text = diagnosis_page(cubic)
+    for said in ("The model lacks something", "Where it arises", "b1 – b2", "Gap over frequency", "NRMSE"):  # noqa: RUF001
+        assert said in text
+    assert text.count("<svg") >= 10
+    assert "http" not in text.replace("http://www.w3.org", "").replace("https://doi.org", "")
+
+
+def test_the_map_shows_the_law_as_the_catalogue_counts_it(cubic):
+    figure = map_figure(cubic, cubic.examination.locations.maps[0])
+    mean = figure.axes[0].lines[1]
+    assert np.corrcoef(mean.get_xdata(), mean.get_ydata())[0, 1] > 0.8  # a spring rises to the right
+
+
+def test_the_summary(cubic, capsys):
+    print_diagnosis(cubic)
+    told = capsys.readouterr().out
+    assert "lacks something" in told
+    assert "Where it arises" in told
+
+
+def test_wrong_numbers_are_named():
+    u = drive()
+    found = diagnose(chain(factor=1.05), record(u, noisy(exact(u))))
+    assert found.verdict == "effect"
+    selected = found.as_dict()["selected"]
+    assert {x["kind"] for x in selected} == {"stiffness_error"}
+    assert {tuple(x["place"]["between"]) for x in selected} == {("ground", "b1"), ("b1", "b2"), ("b2", "b3")}
+    for x in selected:
+        factor = x["parameters"]["factor"]
+        assert abs(factor["value"] - 1 / 1.05) < 5 * factor["std"]
+
+
+def test_the_command(tmp_path):
+    u = drive()
+    y = noisy(exact(u, start=[0.02, 0.0, -0.03, 0.3, 0.0, 0.1]))
+    columns = np.column_stack([np.arange(SAMPLES) * DT, u, y])
+    np.savetxt(tmp_path / "run.csv", columns, delimiter=",", header="time,drive,s0,s1,s2", comments="")
+    write_model(chain(), tmp_path / "model.toml")
+    given = [str(tmp_path / x) for x in ("model.toml", "run.csv")]
+    done = CliRunner().invoke(app, ["diagnose", *given, "--out", str(tmp_path / "out"), "--initial", "rest"])
+    assert done.exit_code == 0, done.output
+    assert "agree with the model" in done.output
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["schema"] == 1
+    assert written["verdict"] == "none"
+    assert written["locations"] == []
+    assert any("does not start at rest" in x for x in written["warnings"])
+    assert read_model(tmp_path / "out" / "model.toml").bodies == ("b1", "b2", "b3")
+    assert set(np.load(tmp_path / "out" / "forces.npz")) == set()
+    assert "Findings" in (tmp_path / "out" / "report.html").read_text()
+    wrong = CliRunner().invoke(
+        app, ["diagnose", *given[:1], str(tmp_path / "no.csv"), "--out", str(tmp_path / "b")]
+    )
+    assert wrong.exit_code == 2
+    assert not (tmp_path / "b").exists()
+
+
+def test_what_must_be_known_is_said():
+    u = drive()
+    y = -noisy(exact(u))
+    friction = Effect("coulomb_friction", (("between", ("ground", "b1")),), {"force": 1.0})
+    found = diagnose(chain(effects=[friction]), record(u, y))
+    said = " ".join(found.warnings)
+    assert "coulomb_friction) were left out" in said
+    assert "larger than the signal itself" in said
+    with pytest.raises(InputError, match="initial 'zero' is unknown"):
+        diagnose(chain(), record(u, y), initial="zero")
+
+
+def test_an_unstable_model_is_judged_by_windows():
+    u = drive()
+    model = lumped_model(
+        ["m"],
+        [1.0],
+        [-4.0],
+        [0.5],
+        connections=[Connection("c", ("ground", "m"))],
+        inputs=[Input("drive", "m")],
+        sensors=[Sensor("s0", "m", "acceleration")],
+    )
+    found = diagnose(model, record(u, exact(u)[:, :1], kinds=((0, "acceleration"),)))
+    assert found.examination.before.windowed
+    assert any("unstable" in x for x in found.warnings)
