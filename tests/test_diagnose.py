@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gap_helpers import DT, JOINT, SAMPLES, chain, drive, exact, noisy, record, with_effect
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 from jaxsid import Effect, InputError, diagnose, read_model, write_model
 from jaxsid.cli import app
 from jaxsid.files.results_json import plain
-from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model
+from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
 from jaxsid.report.diagnosis_page import diagnosis_page
 from jaxsid.report.diagnosis_summary import print_diagnosis
 from jaxsid.report.plots.places import map_figure
@@ -129,10 +130,7 @@ def test_an_unstable_model_is_judged_by_windows():
     u = drive()
     model = lumped_model(
         ["m"],
-        [1.0],
-        [-4.0],
-        [0.5],
-        connections=[Connection("c", ("ground", "m"))],
+        matrices=Matrices(*(jnp.array([[x]]) for x in (1.0, 0.5, -4.0))),
         inputs=[Input("drive", "m")],
         sensors=[Sensor("s0", "m", "acceleration")],
     )
