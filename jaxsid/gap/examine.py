@@ -10,11 +10,12 @@ from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
 from jaxsid.gap.null import Null, null_test, tolerance_test
 from jaxsid.gap.places import places_of
-from jaxsid.gap.recalibrate import as_given, recalibrated
+from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
 
 SIGNIFICANT = 0.01  # probability by chance from which on nothing is claimed
+FAR = 4.0  # times less that a free refit leaves than one within the tolerance, from which on places are sought about it
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 
 
@@ -114,6 +115,11 @@ def examine(model: LumpedModel, records: Record | Sequence[Record]) -> Examinati
         before=gap_of(nothing, records),
         recalibrated=gap_of(after, records),
         refit=freely.model,
-        locations=locate(model, records, noises=noises) if structural else None,
+        locations=locate(model, records, noises=noises, refit=_far(within, freely)) if structural else None,
         noises=noises,
     )
+
+
+def _far(within: Recalibrated, freely: Recalibrated) -> LumpedModel | None:
+    """The refitted model, where it explains so much more that the tolerance may be wrong."""
+    return freely.model if within.squares > FAR * freely.squares else None

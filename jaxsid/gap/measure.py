@@ -71,7 +71,7 @@ def gap_of(fit: Recalibrated, records: Sequence[Record]) -> Gap:
     """
     names = [s.name for s in fit.model.sensors]
     white = [_white(fit, i) for i in range(len(records))]
-    power = [np.nanmean(w**2, axis=0) for w in white]
+    power = [(w**2).mean(axis=0) for w in white]  # NaN for absent sensors
     counts = np.array([np.isfinite(w).all(axis=0) * len(w) for w in white])
     sensors = np.nansum(counts * np.array(power), axis=0) / np.maximum(counts.sum(axis=0), 1)
     horizons = _by_horizon(fit, records)
