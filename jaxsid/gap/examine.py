@@ -14,7 +14,7 @@ from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
 
-SIGNIFICANT = 0.01  # probability by chance from which on nothing is claimed
+SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
 FAR = 4.0  # times less that a free refit leaves than one within the tolerance, from which on places are sought about it
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 
