@@ -121,11 +121,9 @@ def simulated(model: LumpedModel, u: np.ndarray, dt: float, hold: str, start: np
         start: state.
     """
     A, B, C, D = matrices(model)
-    size = len(A)
-    own = (A, B, np.eye(size), np.zeros_like(B))
-    F, G, H, through, _ = scipy.signal.cont2discrete(own, dt, method={"zero": "zoh", "first": "foh"}[hold])
+    F, G, H, through = _sampled(A, B, dt, hold)
     x = np.linalg.solve(H, start - through @ u[0])
-    states = np.empty((len(u), size))
+    states = np.empty((len(u), len(A)))
     for k, push in enumerate(u):
         states[k] = H @ x + through @ push
         x = F @ x + G @ push
@@ -188,13 +186,18 @@ def _chain(mass: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndar
     return across.T @ np.diag(stiffness) @ across, np.diag(mass)
 
 
+def _sampled(A: np.ndarray, B: np.ndarray, dt: float, hold: str) -> tuple[np.ndarray, ...]:
+    """The states sampled, as outputs, since those of a first-order hold are shifted."""
+    own = (A, B, np.eye(len(A)), np.zeros_like(B))
+    found = scipy.signal.cont2discrete(own, dt, method={"zero": "zoh", "first": "foh"}[hold])
+    return tuple(np.asarray(x) for x in found[:4])
+
+
 def _spread(model: LumpedModel, u: np.ndarray, dt: float, hold: str) -> np.ndarray:
     """Rms of each state under the force."""
     A, B, _, _ = matrices(model)
-    size = len(A)
-    own = (A, B, np.eye(size), np.zeros_like(B))
-    F, G, H, through, _ = scipy.signal.cont2discrete(own, dt, method={"zero": "zoh", "first": "foh"}[hold])
-    x, power = np.zeros(size), np.zeros(size)
+    F, G, H, through = _sampled(A, B, dt, hold)
+    x, power = np.zeros(len(A)), np.zeros(len(A))
     for push in u:
         power += (H @ x + through @ push) ** 2
         x = F @ x + G @ push

@@ -88,6 +88,7 @@ def test_nrmse_is_the_noise_of_a_right_model():
     np.testing.assert_allclose(list(gap.nrmse.values()), 0.02, rtol=0.1)
     np.testing.assert_allclose(list(gap.noise_floor.values()), 0.02, rtol=0.2)
     np.testing.assert_allclose([row["noise_units"] for row in gap.by_horizon], 1.0, rtol=0.15)
+    assert [row["name"] for row in gap.by_horizon][:: len(gap.by_horizon) - 1] == ["one step", "free run"]
     assert not gap.windowed
 
 

@@ -11,10 +11,11 @@ from jaxsid.mechanics.lumped import Connection, Matrices, lumped_model, second_o
 
 CUBIC = ("cubic_stiffness", JOINT, {"coefficient": 3e6})
 B12, B1 = Place("between", ("b1", "b2")), Place("between", ("ground", "b1"))
+DRIVE = Place("input", ("drive",))
 LONG = [  # for the long run
     ("hysteresis", JOINT, {"stiffness": 800.0, "beta": 60.0, "gamma": 40.0, "exponent": 1.0}, B12),
     ("backlash", (1, 2), {"half_gap": 0.003}, Place("between", ("b2", "b3"))),
-    ("actuator_saturation", 0, {"limit": 9.0}, Place("input", ("drive",))),
+    ("actuator_saturation", 0, {"limit": 9.0}, DRIVE),
 ]
 CASES = [
     (*CUBIC, B12),
@@ -33,7 +34,9 @@ def measured(kind, place, parameters, kinds=SENSED, seed=0):
 def test_place_is_found_with_all_sensors(kind, place, parameters, expected):
     found = locate(chain(), record(*measured(kind, place, parameters)))
     assert found.ranked[0].place == expected
-    assert found.likely == (expected,)
+    # whatever acts on the driven body may be an error of the drive
+    assert set(found.likely) == ({B1, DRIVE} if expected in (B1, DRIVE) else {expected})
+    assert found.ranked[0].together == found.likely
     assert found.ranked[0].probability > 0.95
     assert found.ranked[0].across < 1.5
 
@@ -52,7 +55,8 @@ def test_delays_of_one_sensor_and_of_the_input_are_one_set():
     kinds = SENSED[1:2]
     u, y = measured("sensor_delay", 0, {"delay": 0.004}, kinds)
     found = locate(chain(kinds), record(u, y, kinds))
-    assert set(found.likely) == {Place("sensor", ("s1",)), Place("input", ("drive",))}
+    assert {Place("sensor", ("s1",)), DRIVE} <= set(found.likely)
+    assert len({x.probability for x in found.ranked if x.place in (Place("sensor", ("s1",)), DRIVE)}) == 1
 
 
 def test_force_is_that_of_the_law():

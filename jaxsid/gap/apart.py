@@ -57,12 +57,12 @@ def expected_differences(
         for s, g, x in zip(settings, guesses, each, strict=True)
     ]
     found, gained = jax.tree.map(lambda *x: sum(x[1:], start=x[0]), *parts)
-    gram, count = np.asarray(found.gram), len(rows)
-    k = gram.shape[2] - count
+    count = len(rows)
+    k = found.gram.shape[2] - count
     value = np.empty((count, count))
     for a in range(count):
-        kept = [*range(k), k + a]
-        own = Table(gram[:, :, kept][:, :, :, kept], found.log_determinant)
+        kept = np.array([*range(k), k + a])
+        own = Table(found.gram[:, :, kept][:, :, :, kept], found.log_determinant)
         # noise that a process takes up speaks for it, as it does in measured lines
         each_one = evidence(own, tried.priors[rows]).value + np.asarray(gained)[:, None]
         value[a] = each_one.reshape(count, -1).max(axis=1)

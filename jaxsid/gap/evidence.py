@@ -143,9 +143,19 @@ def evidence(tables: Table, prior: Float[np.ndarray, "*shape k"]) -> Evidence:
     scale = prior[..., None, :]
     own = scale[..., :, None] * gram[..., :k, :k] * scale[..., None, :] + np.eye(k)
     target = scale * gram[..., :k, k]
-    lower = np.linalg.cholesky(own)
+    try:
+        lower = np.linalg.cholesky(own)
+    except np.linalg.LinAlgError:
+        own = _above_one(own)
+        lower = np.linalg.cholesky(own)
     found = np.linalg.solve(own, target[..., None])[..., 0]
     left = gram[..., k, k] - (target * found).sum(axis=-1)
     half = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     determinant = np.asarray(tables.log_determinant)[..., None, :]
     return Evidence(-0.5 * left - half - 0.5 * determinant, scale * found)
+
+
+def _above_one(own: Float[np.ndarray, "*shape k k"]) -> Float[np.ndarray, "*shape k k"]:
+    """The same without eigenvalues below 1, which rounding alone makes of I + G'G far above the noise."""
+    values, vectors = np.linalg.eigh(own)
+    return (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)

@@ -19,7 +19,8 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.records import Record, as_array
 
-SIGNIFICANT = 0.01  # probability by chance from which on nothing is claimed
+SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
+FAR = 4.0  # times less that a free refit leaves than one within the tolerance, from which on places are sought about it
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 
 
@@ -146,7 +147,7 @@ def examine(
         before=gaps[0],
         recalibrated=gaps[1],
         refit=freely.model,
-        locations=locate(model, records, noises=noises) if structural else None,
+        locations=locate(model, records, noises=noises, refit=_far(within, freely)) if structural else None,
         noises=noises,
         elements=_values(model, freely),
         beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
@@ -173,3 +174,8 @@ def _beside(nominal: Recalibrated, refit: Recalibrated, number: int) -> Beside:
     left = (np.asarray(in_time(x.settings[number].spectra, x.linear[number].left)) for x in (nominal, refit))
     y = np.where(np.asarray(spectra.present) > 0, y, np.nan)
     return Beside(y, *(y - x for x in left))
+
+
+def _far(within: Recalibrated, freely: Recalibrated) -> LumpedModel | None:
+    """The refitted model, where it explains so much more that the tolerance may be wrong."""
+    return freely.model if within.squares > FAR * freely.squares else None

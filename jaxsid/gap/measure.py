@@ -71,7 +71,7 @@ def gap_of(fit: Recalibrated, records: Sequence[Record]) -> Gap:
     """
     names = [s.name for s in fit.model.sensors]
     white = [_white(fit, i) for i in range(len(records))]
-    power = [np.nanmean(w**2, axis=0) for w in white]
+    power = [(w**2).mean(axis=0) for w in white]  # NaN for absent sensors
     counts = np.array([np.isfinite(w).all(axis=0) * len(w) for w in white])
     sensors = np.nansum(counts * np.array(power), axis=0) / np.maximum(counts.sum(axis=0), 1)
     horizons = _by_horizon(fit, records)
@@ -102,7 +102,7 @@ def gap_of(fit: Recalibrated, records: Sequence[Record]) -> Gap:
         _by_frequency(fit, names),
         _by_amplitude(fit, white),
         _by_time(fit, white, names),
-        tuple(row for row, _ in horizons),
+        (_one_step(fit, records), *(row for row, _ in horizons), _free_run(fit, total)),
     )
 
 
@@ -261,8 +261,25 @@ def _by_horizon(fit: Recalibrated, records: Sequence[Record]) -> list[tuple[dict
         squares, count, left, size = (sum(x) for x in zip(*each, strict=True))
         units = float(np.sqrt(squares / max(count, 1.0)))
         nrmse = np.sqrt(left / np.where(np.asarray(size) > 0, size, np.nan))
-        found.append(({"horizon_s": horizon, "noise_units": units}, nrmse))
+        found.append(({"name": f"{part:g} periods", "horizon_s": horizon, "noise_units": units}, nrmse))
     return found
+
+
+def _free_run(fit: Recalibrated, total: float) -> dict[str, Any]:
+    longest = max(s.spectra.samples * float(s.spectra.dt) for s in fit.settings)
+    return {"name": "free run", "horizon_s": longest, "noise_units": total}
+
+
+def _one_step(fit: Recalibrated, records: Sequence[Record]) -> dict[str, Any]:
+    """G of one sample foretold from those before it, from the state that fits these best."""
+    squares, count = 0.0, 0.0
+    for number, record in enumerate(records):
+        window = _window(fit, number, record)
+        length = min(4 * len(fit.settings[number].transient) + 1, len(window.y))
+        found = np.asarray(_last_of_windows(*window, length=length))
+        squares, count = squares + found.sum(), count + len(found) * float((window.weight > 0).sum())
+    step = min(float(r.dt) for r in records)
+    return {"name": "one step", "horizon_s": step, "noise_units": float(np.sqrt(squares / max(count, 1.0)))}
 
 
 def _one_horizon(
@@ -272,16 +289,31 @@ def _one_horizon(
     setting, states = fit.settings[number], len(fit.settings[number].transient)
     samples = setting.spectra.samples
     length = min(max(int(horizon / float(record.dt)), 4 * states), LONGEST, samples)
-    y = np.asarray(in_time(setting.spectra, setting.spectra.y))
-    present = np.asarray(setting.spectra.present) > 0
-    weight = np.where(present, 1 / fit.noises[number].rms(), 0.0)
-    u, _ = ordered_inputs(fit.model, record)
-    system = _sampled(fit.model, record)
-    rest = np.asarray(_windowed(system, u, jnp.asarray(y), jnp.asarray(weight), length=length))
+    window = _window(fit, number, record)
+    rest, weight = np.asarray(_windowed(*window, length=length)), np.asarray(window.weight)
+    y, present = np.asarray(window.y), weight > 0
     used = rest.shape[0] * rest.shape[1]
     count = present.sum() * used - rest.shape[0] * states
     size = present * used * y.var(axis=0)
     return float(((rest * weight) ** 2).sum()), float(count), (rest**2).sum(axis=(0, 1)), size
+
+
+class _Window(NamedTuple):
+    """What windows of a record are cut from: sampled model, inputs, outputs, one over the noise, 0 where absent."""
+
+    system: tuple[Array, Array, Array, Array]
+    u: Array
+    y: Array
+    weight: Array
+
+
+def _window(fit: Recalibrated, number: int, record: Record) -> _Window:
+    spectra = fit.settings[number].spectra
+    weight = np.where(np.asarray(spectra.present) > 0, 1 / fit.noises[number].rms(), 0.0)
+    u, _ = ordered_inputs(fit.model, record)
+    return _Window(
+        _sampled(fit.model, record), jnp.asarray(u), in_time(spectra, spectra.y), jnp.asarray(weight)
+    )
 
 
 def _sampled(model: LumpedModel, record: Record) -> tuple[Array, Array, Array, Array]:
@@ -295,17 +327,35 @@ def _windowed(
     system: tuple[Array, Array, Array, Array], u: Array, y: Array, weight: Array, *, length: int
 ) -> Float[Array, "windows length outputs"]:
     """What the model leaves of windows, each from the state that fits it best."""
+    target, basis = _whitened(system, u, y, weight, length)
+    rest = (target - target @ basis @ basis.T).reshape(len(target), length, -1)
+    return jnp.where(weight > 0, rest / jnp.where(weight > 0, weight, 1.0), 0.0)
+
+
+@compiled
+def _last_of_windows(
+    system: tuple[Array, Array, Array, Array], u: Array, y: Array, weight: Array, *, length: int
+) -> Float[Array, " windows"]:
+    """Square, in its own deviations, of each window's last sample less what those before it foretell."""
+    target, basis = _whitened(system, u, y, weight, length)
+    last = basis[-len(weight) :]
+    rest = target[:, -len(weight) :] - target @ basis @ last.T
+    # left out of the fit, an error grows by this matrix, which is its covariance as well
+    inner = jnp.eye(len(weight), dtype=last.dtype) - last @ last.T
+    return (rest * jnp.linalg.solve(inner, rest.T).T).sum(axis=1)
+
+
+def _whitened(
+    system: tuple[Array, Array, Array, Array], u: Array, y: Array, weight: Array, length: int
+) -> tuple[Float[Array, "windows rows"], Float[Array, "rows n"]]:
+    """Windows less what the inputs do, in noise, and a basis of what states do to them."""
     A, B, C, D = system
     count = len(u) // length
     cut = lambda x: x[: count * length].reshape(count, length, -1)  # noqa: E731
     forced = jax.vmap(lambda part: run(A, B, C, D, part, jnp.zeros(len(A), A.dtype)))(cut(u))
-    left = cut(y) - forced
     free = jnp.swapaxes(powers(A.T, C.T, length), 1, 2)
     columns = (free * weight[:, None]).reshape(-1, len(A))
     norm = jnp.linalg.norm(columns, axis=0)
     columns = columns / jnp.where(norm > 0, norm, 1.0)
     basis, s, _ = jnp.linalg.svd(columns, full_matrices=False)
-    basis = basis * (s > 1e-8 * s[0])
-    target = (left * weight).reshape(count, -1)
-    rest = (target - target @ basis @ basis.T).reshape(left.shape)
-    return jnp.where(weight > 0, rest / jnp.where(weight > 0, weight, 1.0), 0.0)
+    return ((cut(y) - forced) * weight).reshape(count, -1), basis * (s > 1e-8 * s[0])

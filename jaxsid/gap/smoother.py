@@ -71,15 +71,17 @@ def latent_model(
         dt: sampling interval, s.
     """
     n = len(A)
-    zero, one = jnp.zeros_like(rate), jnp.ones_like(rate)
-    own = jnp.stack([jnp.stack([zero, one]), jnp.stack([-(rate**2), -2 * rate])])
-    whole = jnp.zeros((n + 2, n + 2), A.dtype).at[:n, :n].set(A).at[:n, n].set(b).at[n:, n:].set(own)
-    # in units of the force's own deviation, so that the numbers of both halves are alike
-    white = jnp.zeros_like(whole).at[n + 1, n + 1].set(4 * rate**3 * size**2)
+    zero = jnp.zeros_like(rate)
+    own = jnp.stack([jnp.stack([zero, rate]), jnp.stack([-rate, -2 * rate])])
+    whole = jnp.zeros((n + 2, n + 2), A.dtype).at[:n, :n].set(A).at[:n, n].set(b * size).at[n:, n:].set(own)
+    # force and rate in units of their own deviations, so that the exponential is of moderate numbers
+    white = jnp.zeros_like(whole).at[n + 1, n + 1].set(4 * rate)
     both = jnp.block([[-whole, white], [jnp.zeros_like(whole), whole.T]]) * dt
     steps = jax.scipy.linalg.expm(both)
+    unit = jnp.ones(n + 2, A.dtype).at[n].set(size).at[n + 1].set(size * rate)
     F = steps[n + 2 :, n + 2 :].T
-    Q = F @ steps[: n + 2, n + 2 :]
+    Q = F @ steps[: n + 2, n + 2 :] * unit * unit[:, None]
+    F = F * unit[:, None] / unit
     seen = jnp.concatenate([C, d[:, None], jnp.zeros_like(d)[:, None]], axis=1)
     return Latent(F, (Q + Q.T) / 2, seen, jnp.diag(noise**2))
 
