@@ -14,6 +14,7 @@ from jaxsid.records import Record
 
 VERDICTS = {"agreement": "none", "parameters": "effect", "structure": "unknown"}
 KINDS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
+APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 SURE = 3.0  # standard deviations from which on an element's change is one
 MOVING = 0.05  # motion at a record's start, next to that of all of it, that is said
 REVERSED = -0.5  # correlation of a response with what was measured below which a sign is wrong
@@ -37,6 +38,25 @@ class Diagnosis(NamedTuple):
     verdict: str
     examination: Examination
     warnings: tuple[str, ...]
+
+    @property
+    def summary(self) -> tuple[str, str]:
+        """The verdict and what it means, a sentence each."""
+        if self.examination.finding == "structure":
+            return (
+                "The model lacks something.",
+                "No numbers of its masses, springs and dampers explain these records.",
+            )
+        refitted = "refitted within its own structure the model leaves noise alone."
+        if self.examination.finding == "parameters":
+            return (
+                "The model's structure is right, its numbers are not.",
+                f"{refitted[0].upper()}{refitted[1:]}",
+            )
+        told = "The records agree with the model, within its tolerance and the noise."
+        if self.examination.before.total > APART:
+            return told, f"Its numbers are off by no more than they may be; {refitted}"
+        return told, "Nothing that the model lacks is to be seen in these records."
 
     @property
     def remaining(self) -> str:

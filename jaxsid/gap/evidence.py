@@ -143,19 +143,23 @@ def evidence(tables: Table, prior: Float[np.ndarray, "*shape k"]) -> Evidence:
     scale = prior[..., None, :]
     own = scale[..., :, None] * gram[..., :k, :k] * scale[..., None, :] + np.eye(k)
     target = scale * gram[..., :k, k]
-    try:
-        lower = np.linalg.cholesky(own)
-    except np.linalg.LinAlgError:
-        own = _above_one(own)
-        lower = np.linalg.cholesky(own)
-    found = np.linalg.solve(own, target[..., None])[..., 0]
+    found, half = _solved(own, target)
     left = gram[..., k, k] - (target * found).sum(axis=-1)
-    half = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     determinant = np.asarray(tables.log_determinant)[..., None, :]
     return Evidence(-0.5 * left - half - 0.5 * determinant, scale * found)
 
 
-def _above_one(own: Float[np.ndarray, "*shape k k"]) -> Float[np.ndarray, "*shape k k"]:
-    """The same without eigenvalues below 1, which rounding alone makes of I + G'G far above the noise."""
-    values, vectors = np.linalg.eigh(own)
-    return (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+def _solved(
+    own: Float[np.ndarray, "*shape k k"], target: Float[np.ndarray, "*shape k"]
+) -> tuple[Float[np.ndarray, "*shape k"], Float[np.ndarray, "*shape"]]:
+    """Solution, and half the logarithm of the determinant, of matrices I + G'G."""
+    try:
+        lower = np.linalg.cholesky(own)
+    except np.linalg.LinAlgError:
+        # far above the noise rounding makes eigenvalues below 1
+        values, vectors = np.linalg.eigh(own)
+        values = np.maximum(values, 1.0)
+        parts = (np.swapaxes(vectors, -1, -2) @ target[..., None])[..., 0] / values
+        return (vectors @ parts[..., None])[..., 0], 0.5 * np.log(values).sum(axis=-1)
+    found = np.linalg.solve(own, target[..., None])[..., 0]
+    return found, np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)

@@ -122,7 +122,7 @@ def examine(
     say("noise, and the best linear model")
     guessed = noise_of(model, records)
     freely = recalibrated(model, records, guessed, wide=True)
-    within = recalibrated(model, records, freely.noises, wide=False, given=True)
+    within = recalibrated(model, records, freely.noises, wide=False, given=True, start=freely.change)
     say("is the gap real")
     places = places_of(model)
     null, near = null_test(freely, places), null_test(within, places)

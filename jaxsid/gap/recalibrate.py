@@ -18,9 +18,9 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
 
-STEPS = 15  # of Gauss and Newton
+STEPS = 30  # of Gauss and Newton
 ROUNDS = 3  # of finding the noise of what is left, where nothing else tells of it
-SETTLED = 1e-4  # part of the sum of squares that a last step brings
+SETTLED = 0.1, 1e-5  # sum of squares that a last step brings, and its part of what lies above the noise
 LARGEST = 0.3  # relative change of an element in a step
 FIXED = 1e-12  # deviation of what does not vary
 WIDE = {"mass": 0.3, "stiffness": 0.3, "damping": 1.0}  # deviations of what is refitted freely
@@ -67,7 +67,13 @@ class Recalibrated(NamedTuple):
 
 
 def recalibrated(
-    model: LumpedModel, records: Sequence[Record], noises: Sequence[Noise], *, wide: bool, given: bool = False
+    model: LumpedModel,
+    records: Sequence[Record],
+    noises: Sequence[Noise],
+    *,
+    wide: bool,
+    given: bool = False,
+    start: Float[np.ndarray, " e"] | None = None,
 ) -> Recalibrated:
     """Least squares on the lines, by Gauss and Newton, with a normal prior about the nominal values.
 
@@ -79,6 +85,7 @@ def recalibrated(
         noises: one a record; those of source "residual" are found anew from what is left.
         wide: whether the prior is wide, else the model's own tolerance.
         given: whether to take the noises as they are.
+        start: changes to begin with too, beside none at all; the better fit counts.
     """
     elements = element_matrices(model)
     nominal = np.asarray(elements.nominal)
@@ -92,6 +99,8 @@ def recalibrated(
         change = _fit(model, records, noises, change, near).change
     guessed = [n.degrees == 0 and not given for n in noises]
     fit = _fit(model, records, noises, change, prior)
+    if start is not None:
+        fit = min(fit, _fit(model, records, noises, start, prior), key=lambda x: _cost(x, prior))
     for _ in range(ROUNDS if any(guessed) else 0):
         noises = tuple(
             residual_noise(_signals(s, x)) if g else n
@@ -141,7 +150,8 @@ def _fit(
             best, damping = found, damping / 10
         else:
             damping *= 10
-        if abs(gain) < SETTLED * _cost(best, prior) / 10 and (gain >= 0 or damping > 1e3):
+        above = max(_cost(best, prior) - best.equations, 0.0)
+        if abs(gain) < SETTLED[0] + SETTLED[1] * above and (gain >= 0 or damping > 1e3):
             break
     return best
 

@@ -44,20 +44,6 @@ from jaxsid.report.plots.gap import (
 from jaxsid.report.plots.places import force_figure, label_of, map_figure, place_figure
 
 PLACES, TESTS, TIME_FIGURES, MAPS = 8, 6, 4, 3
-SAID = {
-    "agreement": (
-        "The records agree with the model, within its tolerance and the noise.",
-        "Nothing that the model lacks is to be seen in these records.",
-    ),
-    "parameters": (
-        "The model's structure is right, its numbers are not.",
-        "Refitted within its own structure the model leaves noise alone.",
-    ),
-    "structure": (
-        "The model lacks something.",
-        "No numbers of its masses, springs and dampers explain these records.",
-    ),
-}
 REFERENCES = (
     Link(
         "R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012), ch. 6"
@@ -106,7 +92,7 @@ def diagnosis_sections(found: Diagnosis) -> tuple[Section, ...]:
 def _findings(found: Diagnosis) -> Section:
     seen = found.examination
     tone = "good" if found.verdict == "none" else "warning"
-    sentence, meaning = SAID[seen.finding]
+    sentence, meaning = found.summary
     worst = max(seen.before.nrmse, key=lambda name: np.nan_to_num(seen.before.nrmse[name]))
     floor = seen.before.noise_floor[worst]
     cards = [

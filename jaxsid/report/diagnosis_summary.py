@@ -5,9 +5,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 
-from jaxsid.gap.diagnose import Diagnosis
+from jaxsid.gap.diagnose import APART, Diagnosis
 from jaxsid.gap.locate import Locations
-from jaxsid.report.diagnosis_page import SAID, share_of
+from jaxsid.report.diagnosis_page import share_of
 from jaxsid.report.numbers import change, misfit, percent, significant, with_std
 from jaxsid.report.plots.places import label_of
 from jaxsid.report.summary import table
@@ -18,12 +18,12 @@ PLACES = 6
 def print_diagnosis(found: Diagnosis, console: Console | None = None) -> None:
     """Verdict, gap, places and remarks as rich tables, on standard output unless a console is given."""
     console = Console() if console is None else console
-    sentence, meaning = SAID[found.examination.finding]
+    sentence, meaning = found.summary
     console.print(f"\n[bold]{escape(found.nominal.name)}[/]: {sentence} {meaning}")
     console.print(_gap(found))
     if found.examination.locations is not None:
         console.print(_places(found.examination.locations))
-    elif found.examination.finding == "parameters":
+    elif found.examination.before.total > APART:
         console.print(_numbers(found))
     if found.next_experiment:
         console.print(f"To measure next: {found.next_experiment}")
