@@ -80,6 +80,9 @@ class Diagnosis(NamedTuple):
                 if told
                 else "A record with repeated periods, or a quiet start, would tell the noise apart."
             )
+        if any(place.where == "input" for place in found.likely):
+            names = ", ".join(place.ends[0] for place in found.likely if place.where == "input")
+            return f"What enters as {names} by a sensor of its own: it tells an error of the input from a force there."
         if len(found.likely) > 1:
             ends = ", ".join(place.label for place in found.likely)
             return f"One more sensor, on a body that {ends} move differently."

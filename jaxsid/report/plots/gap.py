@@ -109,10 +109,9 @@ def amplitude_figure(found: Diagnosis) -> Figure:
         own = [row for row in rows if tuple(row["between"]) == ends and row["of"] == of]
         edges = np.array([own[0]["range"][0], *(row["range"][1] for row in own)])
         ax.stairs([row["noise_units"] for row in own], edges, color=BLUE, linewidth=1.3, baseline=None)
-        ax.set_ylim(0, None)
-        ax.axhline(1, color=ORANGE, linewidth=1.1, linestyle=(0, (4, 2)))
+        _noise_axis(ax)
         scaled(ax, "x", f"{units.name(of)}\n({units.symbol(of)})", float(np.abs(edges).max()))
-    label(axes[0, 0], y="gap (noise = 1)")
+    axes[0, 1].set_ylabel("")
     return figure
 
 
@@ -126,7 +125,7 @@ def horizon_figure(found: Diagnosis) -> Figure:
     ax = axes[0, 0]
     tables = (found.examination.before, MUTED, "nominal"), (found.examination.recalibrated, BLUE, "refitted")
     for gap, colour, text in tables:
-        rows = [row for row in gap.by_horizon if isinstance(row.get("horizon_s"), float)]
+        rows = sorted(gap.by_horizon, key=lambda row: row["horizon_s"])
         at = [row["horizon_s"] for row in rows], [row["noise_units"] for row in rows]
         ax.plot(*at, "o-", color=colour, markersize=3.6, linewidth=1.2, label=text)
     _noise_axis(ax)
