@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench bench-refine notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine bench-effects notebooks clean
 
 setup: $(STAMP)
 
@@ -39,6 +39,9 @@ bench: $(STAMP) $(PEERS)/.installed
 
 bench-refine: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/refinement.py
+
+bench-effects: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/effects.py $(FIGURES)/effects-truth.npz
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)

@@ -69,9 +69,7 @@ def drive(samples: int = SAMPLES) -> np.ndarray:
 def truth_of(case: Case) -> Truth:
     """The chain with the effect of a case, not yet run."""
     ends = [np.eye(3)[i] - (np.eye(3)[i - 1] if i else 0) for i in range(3)]
-    D, K = (
-        sum(x * np.outer(e, e) for x, e in zip(of, ends, strict=True)) for of in (DAMPING, STIFFNESS)
-    )
+    D, K = (sum(x * np.outer(e, e) for x, e in zip(of, ends, strict=True)) for of in (DAMPING, STIFFNESS))
     chain = Chain(np.diag(MASS), D, K, 0, SENSED)
     return Truth(chain, case.kind, case.place, dict(case.parameters), DT)
 

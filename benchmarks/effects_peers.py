@@ -27,7 +27,7 @@ LAWS = (
     "time_varying_stiffness",
 )
 SMOOTHINGS = (1e-2, 1e-3, 1e-4, 1e-5)  # m/s, of some 0.1 m/s
-LONGEST = 20.0  # s of a trial
+LONGEST = 4.0  # s of a trial
 
 
 class Setting(NamedTuple):
@@ -135,7 +135,11 @@ class Peer:
         for t, end in zip(stops[:-1], stops[1:], strict=True):
             u = self.input_at(t + 1e-9)
             run = solve_ivp(
-                lambda s, x, u=u: self.smooth(s, x, u), (t, end), x, first_step=end - t, **self._options(setting)
+                lambda s, x, u=u: self.smooth(s, x, u),
+                (t, end),
+                x,
+                first_step=end - t,
+                **self._options(setting),
             )
             x = run.y[:, -1]
             states.append(x)
@@ -176,11 +180,12 @@ class Peer:
                 events=stops if way else slips,
                 **self._options(setting),
             )
-            first = np.flatnonzero(inside)[0] if inside.any() else 0
+            first = len(at) - inside.sum()
             states[first : first + len(run.t)], ways[first : first + len(run.t)] = run.y.T, way
             if run.status != 1:
                 break
             t, x = run.t_events[0][0], run.y_events[0][0].copy()
+            states[first + len(run.t) :] = x  # what falls between the event and where the next part begins
             if way:
                 x[N : 2 * N] -= truth.inverse @ e * (e @ x[N : 2 * N]) / truth.W
                 way = 0
@@ -201,7 +206,8 @@ class Peer:
                 a = whole(t, x)[N : 2 * N]
             else:
                 truth.u = self.held
-                a = truth.derivative(t, x, int(t / DT + 1e-9), int(ways[i]))[N : 2 * N]
+                k = int(t / DT + 1e-9)
+                a = truth.derivative(t, x, k, int(ways[i]) or truth.decide(t, x, k))[N : 2 * N]
             y.append(truth.ideal(x, a))
         y, exact = np.array(y), np.round(at, 12)
         plain = y[np.searchsorted(exact, np.round(np.arange(samples) * DT, 12) - 1e-9)]
