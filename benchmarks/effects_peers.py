@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +72,7 @@ class Peer:
 
     def _law(self):
         """The force from time and state; None where all is linear."""
-        kind, p, e, N = self.case.kind, self.case.parameters, self.truth.e, self.N
+        kind, p, N = self.case.kind, self.case.parameters, self.N
         if kind == "periodic_disturbance":
             w = 2 * np.pi * p["frequency_hz"]
             return lambda t, x: p["amplitude"] * np.sin(w * t + p["phase"])
@@ -132,7 +133,7 @@ class Peer:
         jumps = np.arange(round(at[-1] / DT)) * DT + self.late_input % DT
         stops = np.union1d(np.round(at, 12), np.round(jumps, 12))
         x, states = self.truth.x, [self.truth.x]
-        for t, end in zip(stops[:-1], stops[1:], strict=True):
+        for t, end in pairwise(stops):
             u = self.input_at(t + 1e-9)
             run = solve_ivp(
                 lambda s, x, u=u: self.smooth(s, x, u),
@@ -181,7 +182,8 @@ class Peer:
                 **self._options(setting),
             )
             first = len(at) - inside.sum()
-            states[first : first + len(run.t)], ways[first : first + len(run.t)] = run.y.T, way
+            if len(run.t):
+                states[first : first + len(run.t)], ways[first : first + len(run.t)] = run.y.T, way
             if run.status != 1:
                 break
             t, x = run.t_events[0][0], run.y_events[0][0].copy()

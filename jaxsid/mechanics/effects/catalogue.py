@@ -15,11 +15,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxsid.checks import bad_input, is_concrete, require
 from jaxsid.mechanics import effects
 from jaxsid.mechanics.effects.kind import Changes, Kind, Motion, Nominal
+from jaxsid.mechanics.effects.prior import Amplitudes
+
+NOT_KINDS = ("catalogue", "kind", "prior")
 
 
 def _found() -> dict[str, Kind]:
     names = sorted(module.name for module in pkgutil.iter_modules(effects.__path__))
-    modules = (import_module(f"{effects.__name__}.{n}") for n in names if n not in ("catalogue", "kind"))
+    modules = (import_module(f"{effects.__name__}.{n}") for n in names if n not in NOT_KINDS)
     return {module.EFFECT.name: module.EFFECT for module in modules}
 
 
@@ -87,6 +90,19 @@ def parameter_row(name: str, parameters: Mapping[str, ArrayLike], record: int) -
         value = jnp.ravel(jnp.asarray(parameters.get(p.name, p.default), dtype=float))
         row.append(value[min(record, len(value) - 1)])
     return jnp.stack([*row, *[jnp.zeros(())] * (MOST_PARAMETERS - len(row))])
+
+
+def scales(name: str, at: Amplitudes, given: Mapping[str, ArrayLike] = MappingProxyType({})) -> list[Array]:
+    """How large each parameter of a kind is where it matters; its prior is of the ratio to that.
+
+    Args:
+        name: of the kind.
+        at: how its place moves.
+        given: values of parameters that are the power of another's unit; their defaults where left out.
+    """
+    parameters = CATALOGUE[name].parameters
+    powers = {p.name: given.get(p.name, 1.0 if p.default is None else p.default) for p in parameters}
+    return [p.scale.of(at) ** (powers[p.raised] if p.raised else 1) for p in parameters]
 
 
 def sort_of(kind: Kind) -> str:
