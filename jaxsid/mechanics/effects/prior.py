@@ -68,6 +68,11 @@ class Prior(NamedTuple):
     lowest: float
     highest: float
 
+    @property
+    def example(self) -> float:
+        """A ratio to look at: the median of a size, an angle of zero, else one standard deviation up."""
+        return self.centre + self.spread if self.shape == "normal" else self.centre
+
     def log_density(self, ratio: Array) -> Array:
         """Logarithm of the density at a ratio to the scale; -inf beyond the ends."""
         x = jnp.asarray(ratio)
