@@ -27,7 +27,7 @@ LAWS = (
     "cogging_ripple",
     "time_varying_stiffness",
 )
-SMOOTHINGS = (1e-2, 1e-3, 1e-4, 1e-5)  # m/s, of some 0.1 m/s
+SMOOTHINGS = (1e-3, 1e-5)  # m/s, of some 0.1 m/s
 LONGEST = 4.0  # s of a trial
 
 
@@ -232,9 +232,9 @@ def ladders(case: Case) -> Iterator[list[Setting]]:
     if "friction" in case.kind:
         for method in ("RK45", "LSODA"):
             yield [Setting(method, "by event", x) for x in TOLERANCES[:6]]
-        for method in ("LSODA", "RK45", "Radau"):
+        for method in ("LSODA", "Radau"):
             for smoothing in SMOOTHINGS:
-                yield [Setting(method, "whole", x, smoothing) for x in TOLERANCES[1:5]]
+                yield [Setting(method, "whole", x, smoothing) for x in TOLERANCES[1:5:2]]
         return
     yield [Setting("RK23", "by sample", 1e-3), Setting("RK45", "by sample", 1e-3)]
     yield [Setting("DOP853", "by sample", x) for x in (1e-3, 1e-6, 1e-10)]

@@ -158,18 +158,22 @@ def integrate(
             x1, mean = x1 + _apply(rubs, force), mean.at[:count].add(force)
         return x1, sliding, total + mean / substeps
 
-    def sample(carry: tuple, given: tuple[Late, Array]) -> tuple[tuple, tuple]:
-        x, sliding = carry
-        begin = (x, sliding, jnp.zeros(ports, x.dtype))
-        step_of = partial(advance, of_sample=given[0], number=given[1])
-        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
-        return (x1, after), (x, sliding, mean)
-
+    # one row a sample goes in, one comes out: each access costs as much as the arithmetic
+    inputs = late.new.shape[1]
     arrival = jnp.broadcast_to(late.arrival, late.new.shape)
-    steps = late._replace(arrival=arrival), first + jnp.arange(len(late.new), dtype=state.dtype)
-    begin = _sliding_at(speeds, state)
-    _, (states, sliding, mean) = lax.scan(sample, (state, begin), steps)
-    return Path(states, sliding, mean)
+    numbers = first + jnp.arange(len(late.new), dtype=state.dtype)
+    rows = jnp.concatenate([*late[:4], arrival, numbers[:, None]], axis=1)
+
+    def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
+        x, sliding = carry
+        of_sample = Late(*row[:-1].reshape(5, inputs))
+        step_of = partial(advance, of_sample=of_sample, number=row[-1])
+        begin = (x, sliding, jnp.zeros(ports, x.dtype))
+        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
+        return (x1, after), jnp.concatenate([x, sliding, mean])
+
+    _, found = lax.scan(sample, (state, _sliding_at(speeds, state)), rows)
+    return Path(*jnp.split(found, [n, n + count], axis=1))
 
 
 def _sliding_at(speeds: Array, state: Array) -> Array:
