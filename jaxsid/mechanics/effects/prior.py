@@ -4,7 +4,7 @@ import math
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
-from jax.scipy.special import erf
+from jax.lax import erf
 from jaxtyping import Array
 
 REACH = 4.0  # standard deviations at which a slab ends
