@@ -60,17 +60,15 @@ def force_along(kind: Kind, x: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.n
         v: velocity, m/s.
         t: time, s.
     """
-    values, motion = example(kind), [jnp.asarray(a) for a in (x, v, t)]
+    values, spring = example(kind), FORCE / DISPLACEMENT
+    place, speed, time = (jnp.asarray(a) for a in (x, v, t))
     if kind.changes is not None:
-        k = FORCE / DISPLACEMENT
-        nominal = Nominal(*map(jnp.asarray, (k / RATE**2, 0.05 * k / RATE, k)))
-        return np.asarray(_linear_force(kind.changes(nominal, *values), *motion[:2]))
+        nominal = Nominal(*map(jnp.asarray, (spring / RATE**2, 0.05 * spring / RATE, spring)))
+        return np.asarray(_linear_force(kind.changes(nominal, *values), place, speed))
     if kind.slip is not None:
-        return np.asarray(kind.slip(jnp.abs(motion[1]), *values) * jnp.sign(motion[1]))
+        return np.asarray(kind.slip(jnp.abs(speed), *values) * jnp.sign(speed))
     assert kind.force is not None
-    seen = Motion(
-        motion[0], motion[1], jnp.zeros_like(motion[0]), motion[2], jnp.asarray(FORCE / DISPLACEMENT)
-    )
+    seen = Motion(place, speed, jnp.zeros_like(place), time, jnp.asarray(spring))
     if kind.rate is not None:
         seen = seen._replace(memory=_memory(kind, values, seen))
     return np.asarray(kind.force(seen, *values))
@@ -93,8 +91,8 @@ def _memory(kind: Kind, values: list[Array], seen: Motion) -> Array:
     step = 2 * np.pi / RATE / turn
 
     def rate(i: Array, z: Array) -> Array:
-        now = [a[i] for a in (seen.displacement, seen.velocity)]
-        return law(Motion(*now, z, seen.time[i], seen.spring), *values)
+        now = Motion(seen.displacement[i], seen.velocity[i], z, seen.time[i], seen.spring)
+        return law(now, *values)
 
     def advance(z: Array, k: Array) -> tuple[Array, Array]:
         i = k % turn
