@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench bench-refine notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine bench-effects docs notebooks clean
 
 setup: $(STAMP)
 
@@ -40,10 +40,16 @@ bench: $(STAMP) $(PEERS)/.installed
 bench-refine: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/refinement.py
 
+bench-effects: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/effects.py $(FIGURES)/effects-truth.npz
+
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check -c benchmarks/constraints.txt control mdof pymor pyyeti
 	@touch $@
+
+docs: $(STAMP)
+	$(BIN)/jaxsid effects --out docs
 
 notebooks: $(STAMP)
 	$(BIN)/jupyter nbconvert --execute --to html --output-dir build/notebooks notebooks/*.ipynb

@@ -202,9 +202,24 @@ def simulate(
 @app.command()
 def effects(
     kind: Annotated[str | None, typer.Argument(help="One kind in full; default: all, a line each.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="A picture of this kind, .svg or .png; of all kinds, a folder for a page with pictures."
+        ),
+    ] = None,
 ) -> None:
     """The kinds of effects beyond the linear model: friction, backlash, delays and others, for [[effects]]."""
     with _errors():
+        if out is not None:
+            _numerics()
+            from jaxsid.report.effects_page import write_page, write_picture
+
+            if kind is None:
+                write_page(out)
+            else:
+                write_picture(kind, out)
+            return
         from jaxsid.report.effects import print_effect, print_effects
 
         if kind is None:

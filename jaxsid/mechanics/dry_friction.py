@@ -43,8 +43,8 @@ def friction(
         free: speeds at the end if nothing rubbed.
         give: what a unit of each force takes off each speed, symmetric and positive where forces act.
     """
-    acting = _acting(kinds)
-    if not acting:
+    able_slots = acting(kinds)
+    if not able_slots:
         return Contact(jnp.zeros_like(before), sliding)
     start = jnp.where(sliding == 0, 0.0, before)
     most = slips(kinds, parameters, jnp.zeros_like(start))
@@ -56,14 +56,14 @@ def friction(
     def sweep(_: Array | int, found: tuple[Array, Array]) -> tuple[Array, Array]:
         force, after = found
         level = slips(kinds, parameters, 0.5 * (jnp.abs(start) + jnp.abs(after)))
-        for i in acting:
+        for i in able_slots:
             alone = free[i] - off[i] @ force
             new = _one(start[i], sliding[i], alone, own[i], level[i], most[i], able[i])
             force, after = force.at[i].set(new[0]), after.at[i].set(new[2])
         return force, after
 
     found = jnp.zeros_like(start), start
-    if len(acting) == 1:  # unrolled: a loop within a loop costs more than what it does
+    if len(able_slots) == 1:  # unrolled: a loop within a loop costs more than what it does
         for i in range(ROUNDS):
             found = sweep(i, found)
     else:
@@ -90,8 +90,8 @@ def holding(
         gain: relative accelerations if nothing held.
         give: what a unit of each force takes off each acceleration.
     """
-    acting = _acting(kinds)
-    if not acting:
+    able_slots = acting(kinds)
+    if not able_slots:
         return jnp.zeros_like(gain)
     most = slips(kinds, parameters, jnp.zeros_like(gain))
     own = jnp.diag(give)
@@ -100,19 +100,23 @@ def holding(
     off = give - jnp.diag(jnp.diag(give))
 
     def sweep(_: Array | int, force: Array) -> Array:
-        for i in acting:
+        for i in able_slots:
             force = force.at[i].set(
                 jnp.clip((gain[i] - off[i] @ force) / own[i], -most[i], most[i]) * held[i]
             )
         return force
 
-    if len(acting) < 2:
+    if len(able_slots) < 2:
         return sweep(0, jnp.zeros_like(gain))
     return lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(gain))
 
 
-def _acting(kinds: Numbers) -> list[int]:
-    """Slots that may be dry friction, as far as is known while the program is traced."""
+def acting(kinds: Numbers) -> list[int]:
+    """Slots that may be dry friction, as far as is known while the program is traced.
+
+    Args:
+        kinds: numbers of the kinds.
+    """
     rubs = rubbing(kinds)
     return [i for i in range(len(rubs)) if not isinstance(rubs, np.ndarray) or rubs[i]]
 

@@ -14,8 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsid.mechanics.augmented import Augmented
-from jaxsid.mechanics.dry_friction import friction, holding
-from jaxsid.mechanics.effects.catalogue import forces, rates, slips
+from jaxsid.mechanics.dry_friction import acting, friction, holding
+from jaxsid.mechanics.effects.catalogue import forces, possible, rates, slips
 from jaxsid.mechanics.effects.kind import Motion
 from jaxsid.mechanics.functions_of_matrices import phi_functions
 from jaxsid.mechanics.held_input import Late, line_over_step
@@ -104,7 +104,8 @@ def _ports(slots: Slots, spring: Array, seen: Array, time: Array) -> Array:
     d, v, z = jnp.split(seen, 3)
     motion = Motion(d, v, z, time, spring)
     found = (law(slots.kinds, slots.parameters, motion) for law in (forces, rates))
-    return jnp.concatenate(list(found))
+    # once for all that use it, not again for each of their entries
+    return lax.optimization_barrier(jnp.concatenate(list(found)))
 
 
 def integrate(
@@ -134,6 +135,7 @@ def integrate(
     speeds = system.seen[count : 2 * count]
     rubs, give = step.rubs, -speeds @ step.rubs
     law = partial(_ports, slots, system.spring)
+    pushed = any(kind.force is not None for kind in possible(slots.kinds))
 
     def advance(i: Array, carry: tuple, of_sample: Late, number: Array) -> tuple:
         x, sliding, total = carry
@@ -141,31 +143,37 @@ def integrate(
         time = dt * (number + i / substeps)
         free = _apply(step.linear, jnp.concatenate([x, value, change]))
         ahead, w0, wm, w1 = jnp.split(free, [n, n + 3 * count, n + 6 * count])
-        f0 = law(w0, time)
-        fa = law(wm + _apply(step.middle, f0), time + h / 2)
-        fb = law(wm + _apply(step.middle, fa), time + h / 2)
-        late_half = _apply(step.middle, 2 * fb - f0)
-        f1 = law(w1 + _apply(step.carried, f0) + late_half, time + h)
-        x1 = ahead + _apply(step.weights, jnp.concatenate([f0, fa + fb, f1]))
-        contact = friction(
-            slots.kinds, slots.parameters, w0[count : 2 * count], sliding, _apply(speeds, x1), give
-        )
-        mean = (f0 + 2 * (fa + fb) + f1) / 6
-        mean = mean.at[:count].add(contact.force)
-        return x1 + _apply(rubs, contact.force), contact.sliding, total + mean / substeps
+        x1, mean = ahead, jnp.zeros_like(total)
+        if pushed:
+            f0 = law(w0, time)
+            fa = law(wm + _apply(step.middle, f0), time + h / 2)
+            fb = law(wm + _apply(step.middle, fa), time + h / 2)
+            late_half = _apply(step.middle, 2 * fb - f0)
+            f1 = law(w1 + _apply(step.carried, f0) + late_half, time + h)
+            x1 = x1 + _apply(step.weights, jnp.concatenate([f0, fa + fb, f1]))
+            mean = (f0 + 2 * (fa + fb) + f1) / 6
+        if acting(slots.kinds):
+            before, free = w0[count : 2 * count], _apply(speeds, x1)
+            force, sliding = friction(slots.kinds, slots.parameters, before, sliding, free, give)
+            x1, mean = x1 + _apply(rubs, force), mean.at[:count].add(force)
+        return x1, sliding, total + mean / substeps
 
-    def sample(carry: tuple, given: tuple[Late, Array]) -> tuple[tuple, tuple]:
-        x, sliding = carry
-        begin = (x, sliding, jnp.zeros(ports, x.dtype))
-        step_of = partial(advance, of_sample=given[0], number=given[1])
-        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
-        return (x1, after), (x, sliding, mean)
-
+    # one row a sample goes in, one comes out: each access costs as much as the arithmetic
+    inputs = late.new.shape[1]
     arrival = jnp.broadcast_to(late.arrival, late.new.shape)
-    steps = late._replace(arrival=arrival), first + jnp.arange(len(late.new), dtype=state.dtype)
-    begin = _sliding_at(speeds, state)
-    _, (states, sliding, mean) = lax.scan(sample, (state, begin), steps)
-    return Path(states, sliding, mean)
+    numbers = first + jnp.arange(len(late.new), dtype=state.dtype)
+    rows = jnp.concatenate([*late[:4], arrival, numbers[:, None]], axis=1)
+
+    def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
+        x, sliding = carry
+        of_sample = Late(*row[:-1].reshape(5, inputs))
+        step_of = partial(advance, of_sample=of_sample, number=row[-1])
+        begin = (x, sliding, jnp.zeros(ports, x.dtype))
+        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
+        return (x1, after), jnp.concatenate([x, sliding, mean])
+
+    _, found = lax.scan(sample, (state, _sliding_at(speeds, state)), rows)
+    return Path(*jnp.split(found, [n, n + count], axis=1))
 
 
 def _sliding_at(speeds: Array, state: Array) -> Array:

@@ -13,6 +13,7 @@ from jaxsid.checks import InputError, is_concrete
 from jaxsid.compilation import compiled
 from jaxsid.least_squares import forward, levenberg_marquardt
 from jaxsid.mechanics.band import extend
+from jaxsid.mechanics.effects.catalogue import by_sort
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.nonlinear import Response, respond, state_count
 from jaxsid.mechanics.slots import Slots, slots_of
@@ -77,6 +78,8 @@ def driven(model: LumpedModel, u: Array, hold: tuple[str, ...], dt: Array, recor
     slots = jax.tree.map(
         lambda x: x if jnp.issubdtype(x.dtype, jnp.integer) else x.astype(dtype), slots_of(model, record)
     )
+    if is_concrete(slots.kinds):
+        slots = eqx.tree_at(lambda s: s.kinds, slots, by_sort(slots.kinds))
     u, dt = u.astype(dtype), jnp.asarray(dt, dtype)
     if "band" in hold:
         ramps = jnp.ones(len(hold), bool)

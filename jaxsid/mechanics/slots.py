@@ -3,9 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, kind_number, parameter_row
+from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, Numbers, kind_number, parameter_row
 from jaxsid.mechanics.effects.kind import Nominal
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.records import SecondOrderModel, as_array
@@ -15,7 +15,8 @@ class Slots(eqx.Module):
     """Effects, each with its kind, parameters and place; all rows may be traced.
 
     Attributes:
-        kinds: (slots,) numbers in the catalogue; in numpy inside a program that is for these kinds only.
+        kinds: (slots,) numbers in the catalogue; in numpy inside a program that is for these kinds only, sorted in
+            one that is for their sorts.
         parameters: (slots, most) in the order of the kind.
         joints: (slots, N) +1 and -1 at the second and first end, +1 at a body; zero for signals.
         pushes: (slots, N) where and how a positive force acts: -joints between two ends, +1 at a body.
@@ -23,7 +24,7 @@ class Slots(eqx.Module):
         inputs: (slots, inputs) 1 at the input.
     """
 
-    kinds: Int[Array, " slots"] | Int[np.ndarray, " slots"]
+    kinds: Numbers
     parameters: Float[Array, "slots most"]
     joints: Float[Array, "slots N"]
     pushes: Float[Array, "slots N"]

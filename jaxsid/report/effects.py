@@ -14,6 +14,11 @@ PLACES = {
     "input": 'input = "input"',
 }
 
+SYMBOLS = (
+    "rms values at the place, F force, d displacement, v velocity, s signal, w slowest natural frequency (rad/s); "
+    "T length of the record."
+)
+
 
 def print_effects(console: Console | None = None) -> None:
     """All kinds: where they act, their law, their parameters.
@@ -44,14 +49,21 @@ def print_effect(name: str, console: Console | None = None) -> None:
     out.print(f"[bold]{kind.name}[/bold]: {escape(kind.law)}", highlight=False)
     out.print(escape(kind.about), highlight=False)
     table = Table()
-    for column in ("parameter", "unit (moving, turning)", "least", "default"):
+    for column in (
+        "parameter",
+        "unit (moving, turning)",
+        "least",
+        "default",
+        "scale",
+        "prior, next to the scale",
+    ):
         table.add_column(column)
     for p in kind.parameters:
         lowest = "" if p.lowest == -float("inf") else f"{p.lowest:g}"
-        table.add_row(
-            p.name, escape(_units(p)), lowest, "required" if p.default is None else f"{p.default:g}"
-        )
+        default = "required" if p.default is None else f"{p.default:g}"
+        table.add_row(p.name, escape(units_of(p)), lowest, default, scale_of(p), str(p.prior))
     out.print(table)
+    out.print(f"Scales: {SYMBOLS}", highlight=False)
     out.print(f"Source: {escape(kind.source)}", highlight=False)
     out.print("In a model file:\n", highlight=False)
     out.print(escape(model_lines(kind)), highlight=False, soft_wrap=True)
@@ -73,5 +85,20 @@ def _told(parameter: Parameter) -> str:
     return f"{parameter.name} ({unit})" if unit else parameter.name
 
 
-def _units(parameter: Parameter) -> str:
+def scale_of(parameter: Parameter) -> str:
+    """What a parameter's size goes by, in symbols.
+
+    Args:
+        parameter: of a kind.
+    """
+    text = str(parameter.scale) or "1"
+    return f"({text})^n" if parameter.raised else text
+
+
+def units_of(parameter: Parameter) -> str:
+    """Units of a parameter where bodies move, and where they turn.
+
+    Args:
+        parameter: of a kind.
+    """
     return ", ".join(dict.fromkeys(x for x in parameter.unit if x)) or "none"

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from jaxsid.report.style import CSS_COLOURS
 
 SETTINGS: dict[Any, Any] = {"svg.hashsalt": "jaxsid", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
+DPI = 150  # of what is drawn as an image
+NOTHING: Any = {"Date": None, "Creator": None}
 REFERENCES = re.compile(r'(?:xlink:href="#|url\(#)([^")]+)')
 PATH = re.compile(r'\sd="([^"]*)"')
 LONG = re.compile(r"(\d\.\d\d)\d+")
@@ -20,14 +22,23 @@ IDENTITY = re.compile(r'\sid="([^"]+)"')
 
 def inline_svg(figure: Figure, alternative: str) -> str:
     """An <svg> element that scales with its place; `alternative` is read to those who cannot see it."""
-    stream = io.StringIO()
-    with matplotlib.rc_context(SETTINGS):
-        figure.savefig(stream, format="svg", facecolor="none", metadata={"Date": None, "Creator": None})
-    text = _short(stream.getvalue())
+    text = _drawn(figure, "none")
     text = _own_names(text, hashlib.sha256(text.encode()).hexdigest()[:8])
     for colour, variable in CSS_COLOURS.items():
         text = text.replace(colour, f"var({variable})")
     return _opened(text, alternative)
+
+
+def file_svg(figure: Figure) -> str:
+    """An SVG file of its own, on white."""
+    return _own_names(_drawn(figure, "white"), "p") + "\n"
+
+
+def _drawn(figure: Figure, ground: str) -> str:
+    stream = io.StringIO()
+    with matplotlib.rc_context(SETTINGS):
+        figure.savefig(stream, format="svg", facecolor=ground, dpi=DPI, metadata=NOTHING)
+    return _short(stream.getvalue())
 
 
 def _short(text: str) -> str:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import STIFFNESS, Kind, Motion, Parameter
+from jaxsid.mechanics.effects.prior import PART, Scale
 
 
 def _force(at: Motion, stiffness: Array) -> Array:
@@ -13,7 +14,7 @@ def _force(at: Motion, stiffness: Array) -> Array:
 EFFECT = Kind(
     name="bilinear_stiffness",
     where="between",
-    parameters=(Parameter("stiffness", STIFFNESS),),
+    parameters=(Parameter("stiffness", STIFFNESS, Scale(force=1, displacement=-1), PART),),
     law="F = p d for d > 0 only",
     about="A crack that closes, a chain, a belt, a one-sided support.",
     source="K. Worden and G. R. Tomlinson, Nonlinearity in Structural Dynamics, 2001.",

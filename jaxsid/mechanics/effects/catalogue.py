@@ -7,6 +7,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -14,11 +15,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxsid.checks import bad_input, is_concrete, require
 from jaxsid.mechanics import effects
 from jaxsid.mechanics.effects.kind import Changes, Kind, Motion, Nominal
+from jaxsid.mechanics.effects.prior import Amplitudes
+
+NOT_KINDS = ("catalogue", "kind", "prior")
 
 
 def _found() -> dict[str, Kind]:
     names = sorted(module.name for module in pkgutil.iter_modules(effects.__path__))
-    modules = (import_module(f"{effects.__name__}.{n}") for n in names if n not in ("catalogue", "kind"))
+    modules = (import_module(f"{effects.__name__}.{n}") for n in names if n not in NOT_KINDS)
     return {module.EFFECT.name: module.EFFECT for module in modules}
 
 
@@ -88,23 +92,70 @@ def parameter_row(name: str, parameters: Mapping[str, ArrayLike], record: int) -
     return jnp.stack([*row, *[jnp.zeros(())] * (MOST_PARAMETERS - len(row))])
 
 
-Numbers = Int[Array, " slots"] | Int[np.ndarray, " slots"]
+def scales(name: str, at: Amplitudes, given: Mapping[str, ArrayLike] = MappingProxyType({})) -> list[Array]:
+    """How large each parameter of a kind is where it matters; its prior is of the ratio to that.
+
+    Args:
+        name: of the kind.
+        at: how its place moves.
+        given: values of parameters that are the power of another's unit; their defaults where left out.
+    """
+    parameters = CATALOGUE[name].parameters
+    powers = {p.name: given.get(p.name, 1.0 if p.default is None else p.default) for p in parameters}
+    return [p.scale.of(at) ** (powers[p.raised] if p.raised else 1) for p in parameters]
+
+
+def sort_of(kind: Kind) -> str:
+    """What a program has to compute for a kind: "dry" friction, a "law", or "linear" for nothing beside matrices."""
+    return "dry" if kind.slip is not None else "linear" if kind.force is None else "law"
+
+
+class Sorted(eqx.Module):
+    """Numbers of kinds that may be traced, of which no more is known than their sorts.
+
+    Attributes:
+        numbers: of the kinds.
+        sorts: of each, from `sort_of`.
+    """
+
+    numbers: Int[Array, " slots"]
+    sorts: tuple[str, ...] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.sorts)
+
+
+# of kinds of which nothing is known while a program is traced; all; their sorts
+Numbers = Int[Array, " slots"] | Int[np.ndarray, " slots"] | Sorted
+
+
+def by_sort(kinds: Int[Array, " slots"]) -> Sorted:
+    """Numbers of kinds with their sorts, so that few programs, short ones where they can be, serve all.
+
+    Args:
+        kinds: known numbers.
+    """
+    every = [sort_of(kind) for kind in CATALOGUE.values()]
+    return Sorted(kinds, tuple(every[i] for i in np.asarray(kinds)))
 
 
 def _chosen(kind: Kind, kinds: Numbers, parameters: Array) -> tuple[Array, list[Array]]:
     """Which slots are of a kind, and their parameters; typical ones for the others, whose results are dropped."""
-    here = jnp.asarray(kinds) == kind_number(kind.name)
+    numbers = kinds.numbers if isinstance(kinds, Sorted) else kinds
+    here = jnp.asarray(numbers) == kind_number(kind.name)
     return here, [jnp.where(here, parameters[:, i], p.typical) for i, p in enumerate(kind.parameters)]
 
 
 def possible(kinds: Numbers) -> list[Kind]:
-    """All kinds; where the slots' kinds are known while the program is traced, those alone.
+    """All kinds; where the slots' kinds or sorts are known while the program is traced, those alone.
 
     Args:
         kinds: numbers of the kinds.
     """
     if isinstance(kinds, np.ndarray):
         return [kind for number, kind in enumerate(CATALOGUE.values()) if number in kinds]
+    if isinstance(kinds, Sorted):
+        return [kind for kind in CATALOGUE.values() if sort_of(kind) in kinds.sorts]
     return list(CATALOGUE.values())
 
 
@@ -141,6 +192,8 @@ def slips(kinds: Numbers, parameters: Float[Array, "slots most"], speed: Array) 
 
 def rubbing(kinds: Numbers) -> Bool[Array, " slots"] | Bool[np.ndarray, " slots"]:
     """Which slots are dry friction, whatever its magnitude."""
+    if isinstance(kinds, Sorted):
+        return np.array([sort == "dry" for sort in kinds.sorts])
     numbers = [kind_number(kind.name) for kind in CATALOGUE.values() if kind.slip is not None]
     return (np if isinstance(kinds, np.ndarray) else jnp).isin(kinds, np.array(numbers))
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import FORCE, Kind, Motion, Parameter
+from jaxsid.mechanics.effects.prior import ANGLE, PART, Scale, size
 
 
 def _force(at: Motion, amplitude: Array, wavenumber: Array, phase: Array) -> Array:
@@ -14,9 +15,9 @@ EFFECT = Kind(
     name="cogging_ripple",
     where="between",
     parameters=(
-        Parameter("amplitude", FORCE),
-        Parameter("wavenumber", ("rad/m", "rad/rad")),
-        Parameter("phase", ("rad", "rad"), default=0.0),
+        Parameter("amplitude", FORCE, Scale(force=1), PART),
+        Parameter("wavenumber", ("rad/m", "rad/rad"), Scale(displacement=-1), size(3.0, 5.0)),
+        Parameter("phase", ("rad", "rad"), Scale(), ANGLE, default=0.0),
     ),
     law="F = p sin(w d + phi)",
     about="Magnets of a motor attract its teeth, balls of a guide pass its edge, teeth of a gear mesh.",

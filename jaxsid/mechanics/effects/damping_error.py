@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import DAMPING, NONE, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import PART, Scale, slab
 
 
 def _changes(at: Nominal, factor: Array, value: Array) -> Changes:
@@ -13,8 +14,8 @@ EFFECT = Kind(
     name="damping_error",
     where="between",
     parameters=(
-        Parameter("factor", NONE, lowest=0.0, default=1.0),
-        Parameter("value", DAMPING, default=0.0),
+        Parameter("factor", NONE, Scale(), slab(2.0, centre=1.0, lowest=0.0), lowest=0.0, default=1.0),
+        Parameter("value", DAMPING, Scale(force=1, velocity=-1), PART, default=0.0),
     ),
     law="c = factor c_nominal; value where c_nominal is 0",
     about="Damping differs from the nominal one, which is seldom known better than by a factor of two.",

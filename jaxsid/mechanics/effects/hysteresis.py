@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import NONE, STIFFNESS, Kind, Motion, Parameter, power
+from jaxsid.mechanics.effects.prior import PART, Scale, size, slab
 
 
 def _force(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Array) -> Array:
@@ -19,10 +20,10 @@ EFFECT = Kind(
     name="hysteresis",
     where="between",
     parameters=(
-        Parameter("stiffness", STIFFNESS),
-        Parameter("beta", ("1/m^n", "1/rad^n")),
-        Parameter("gamma", ("1/m^n", "1/rad^n")),
-        Parameter("exponent", NONE, lowest=1.0, default=1.0),
+        Parameter("stiffness", STIFFNESS, Scale(force=1, displacement=-1), PART),
+        Parameter("beta", ("1/m^n", "1/rad^n"), Scale(displacement=-1), size(1.0, 3.0), raised="exponent"),
+        Parameter("gamma", ("1/m^n", "1/rad^n"), Scale(displacement=-1), slab(1.0), raised="exponent"),
+        Parameter("exponent", NONE, Scale(), slab(1.0, centre=1.0, lowest=1.0), lowest=1.0, default=1.0),
     ),
     law="F = a z, z' = v - beta abs(v) abs(z)^(n-1) z - gamma v abs(z)^n",
     about="Wire ropes, rubber, joints that slip a little: the force lags behind, as a loop of some width.",

@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import TIME, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import LATE, Scale
 
 
 def _changes(at: Nominal, delay: Array) -> Changes:
@@ -12,7 +13,7 @@ def _changes(at: Nominal, delay: Array) -> Changes:
 EFFECT = Kind(
     name="input_delay",
     where="input",
-    parameters=(Parameter("delay", TIME, lowest=0.0, typical=0.0),),
+    parameters=(Parameter("delay", TIME, Scale(rate=-1), LATE, lowest=0.0, typical=0.0),),
     law="held input at t - delay",
     about="Computing time and transmission between command and force.",
     source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",

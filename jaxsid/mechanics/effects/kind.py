@@ -6,6 +6,8 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxsid.mechanics.effects.prior import Prior, Scale
+
 Units = tuple[str, str]  # of bodies that move, of bodies that turn
 Where = Literal["between", "body", "sensor", "input"]
 
@@ -26,16 +28,22 @@ class Parameter(NamedTuple):
     Attributes:
         name: as in the model file.
         unit: of bodies that move and of bodies that turn.
+        scale: what its size goes by at a place.
+        prior: of its ratio to that scale.
         lowest: least value that makes sense.
         default: what it is when it is left out; None where it must be given.
         typical: any value at which the law is finite, used where the law is not asked for.
+        raised: name of the parameter whose value is the power of the scale, for a unit with such a power.
     """
 
     name: str
     unit: Units
+    scale: Scale
+    prior: Prior
     lowest: float = -float("inf")
     default: float | None = None
     typical: float = 1.0
+    raised: str | None = None
 
 
 class Motion(NamedTuple):

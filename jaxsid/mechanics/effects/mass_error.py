@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import MASS, NONE, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import GAIN, PART, Scale
 
 
 def _changes(at: Nominal, factor: Array, value: Array) -> Changes:
@@ -13,8 +14,8 @@ EFFECT = Kind(
     name="mass_error",
     where="body",
     parameters=(
-        Parameter("factor", NONE, lowest=0.0, default=1.0),
-        Parameter("value", MASS, default=0.0),
+        Parameter("factor", NONE, Scale(), GAIN, lowest=0.0, default=1.0),
+        Parameter("value", MASS, Scale(force=1, velocity=-1, rate=-1), PART, default=0.0),
     ),
     law="m = factor m_nominal, or m_nominal + value",
     about="The mass or inertia differs from the nominal one: an unmodelled part moves along, or its size was guessed.",

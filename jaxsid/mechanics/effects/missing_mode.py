@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import DAMPING, MASS, STIFFNESS, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import Scale, size
 
 
 def _changes(at: Nominal, mass: Array, stiffness: Array, damping: Array) -> Changes:
@@ -13,9 +14,9 @@ EFFECT = Kind(
     name="missing_mode",
     where="body",
     parameters=(
-        Parameter("mass", MASS, lowest=0.0),
-        Parameter("stiffness", STIFFNESS, lowest=0.0),
-        Parameter("damping", DAMPING, lowest=0.0, default=0.0),
+        Parameter("mass", MASS, Scale(force=1, velocity=-1, rate=-1), size(0.1, 3.0), lowest=0.0),
+        Parameter("stiffness", STIFFNESS, Scale(force=1, displacement=-1), size(0.3, 10.0), lowest=0.0),
+        Parameter("damping", DAMPING, Scale(force=1, velocity=-1), size(0.01, 10.0), lowest=0.0, default=0.0),
     ),
     law="m x'' + c (x' - x_b') + k (x - x_b) = 0, its spring and damper pulling at the body",
     about="A flexible part that was taken for rigid: it adds a resonance and splits those near it.",

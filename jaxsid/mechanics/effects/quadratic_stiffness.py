@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import Kind, Motion, Parameter
+from jaxsid.mechanics.effects.prior import PART, Scale
 
 
 def _force(at: Motion, coefficient: Array) -> Array:
@@ -12,7 +13,7 @@ def _force(at: Motion, coefficient: Array) -> Array:
 EFFECT = Kind(
     name="quadratic_stiffness",
     where="between",
-    parameters=(Parameter("coefficient", ("N/m²", "N m/rad²")),),
+    parameters=(Parameter("coefficient", ("N/m²", "N m/rad²"), Scale(force=1, displacement=-2), PART),),
     law="F = p d^2",
     about="A preloaded or sagging spring, a curved part: stiffer one way, softer the other.",
     source="K. Worden and G. R. Tomlinson, Nonlinearity in Structural Dynamics, 2001.",

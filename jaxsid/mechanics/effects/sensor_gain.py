@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import NONE, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import GAIN, Scale
 
 
 def _changes(at: Nominal, factor: Array) -> Changes:
@@ -12,7 +13,7 @@ def _changes(at: Nominal, factor: Array) -> Changes:
 EFFECT = Kind(
     name="sensor_gain",
     where="sensor",
-    parameters=(Parameter("factor", NONE),),
+    parameters=(Parameter("factor", NONE, Scale(), GAIN),),
     law="output x factor",
     about="A wrong calibration, a loose transducer, a reading in other units.",
     source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",

@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import NONE, STIFFNESS, Changes, Kind, Nominal, Parameter
+from jaxsid.mechanics.effects.prior import GAIN, PART, Scale
 
 
 def _changes(at: Nominal, factor: Array, value: Array) -> Changes:
@@ -13,8 +14,8 @@ EFFECT = Kind(
     name="stiffness_error",
     where="between",
     parameters=(
-        Parameter("factor", NONE, lowest=0.0, default=1.0),
-        Parameter("value", STIFFNESS, default=0.0),
+        Parameter("factor", NONE, Scale(), GAIN, lowest=0.0, default=1.0),
+        Parameter("value", STIFFNESS, Scale(force=1, displacement=-1), PART, default=0.0),
     ),
     law="k = factor k_nominal; value where k_nominal is 0",
     about="Springs are softer or stiffer than the nominal ones: wear, a loose joint, a wrong dimension.",

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import FORCE, SPEED, Kind, Parameter
+from jaxsid.mechanics.effects.prior import POSITIVE_PART, Scale, size, slab
 
 
 def _slip(speed: Array, force: Array, static_force: Array, velocity: Array) -> Array:
@@ -14,9 +15,9 @@ EFFECT = Kind(
     name="stribeck_friction",
     where="between",
     parameters=(
-        Parameter("force", FORCE, lowest=0.0),
-        Parameter("static_force", FORCE, lowest=0.0),
-        Parameter("velocity", SPEED, lowest=0.0),
+        Parameter("force", FORCE, Scale(force=1), POSITIVE_PART, lowest=0.0),
+        Parameter("static_force", FORCE, Scale(force=1), slab(0.5, lowest=0.0), lowest=0.0),
+        Parameter("velocity", SPEED, Scale(velocity=1), size(0.3, 3.0), lowest=0.0),
     ),
     law="F = (Fc + (Fs - Fc) exp(-(v/vs)^2)) sign(v), sticking at v = 0",
     about="Lubricated contacts break loose at a static level and slide at a lower one, so that slow motion jerks.",

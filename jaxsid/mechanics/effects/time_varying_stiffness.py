@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import Kind, Motion, Parameter
+from jaxsid.mechanics.effects.prior import PART, Scale
 
 
 def _force(at: Motion, rate: Array) -> Array:
@@ -12,7 +13,9 @@ def _force(at: Motion, rate: Array) -> Array:
 EFFECT = Kind(
     name="time_varying_stiffness",
     where="between",
-    parameters=(Parameter("rate", ("N/(m s)", "N m/(rad s)")),),
+    parameters=(
+        Parameter("rate", ("N/(m s)", "N m/(rad s)"), Scale(force=1, displacement=-1, duration=-1), PART),
+    ),
     law="F = p t d, t from the record's start",
     about="Warming, loosening or damage during the measurement.",
     source="K. Liu, J. Sound Vib. 206 (1997).",

@@ -1,5 +1,6 @@
-"""Figures of an identification, each a function that returns a matplotlib Figure."""
+"""Figures of an identification, each a function that returns a matplotlib Figure, and of the kinds of effects."""
 
+from jaxsid.report.plots.effects import effect_figure
 from jaxsid.report.plots.frequency import frequency_figure
 from jaxsid.report.plots.impulse import impulse_figure
 from jaxsid.report.plots.matrices import matrix_figure
@@ -12,6 +13,7 @@ from jaxsid.report.plots.time import time_figure
 
 __all__ = [
     "correlation_figure",
+    "effect_figure",
     "frequency_figure",
     "impulse_figure",
     "matrix_figure",

@@ -1,0 +1,123 @@
+"""Scales and priors of every kind's parameters: they are there, they follow the units, they are distributions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsid
+from jaxsid.examples import systems
+from jaxsid.mechanics.amplitudes import amplitudes
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, scales
+from jaxsid.mechanics.effects.kind import Motion, Nominal
+from jaxsid.mechanics.effects.prior import Amplitudes, Prior, Scale
+from jaxsid.mechanics.lumped import Effect, second_order
+from jaxsid.mechanics.slots import slots_of
+
+LENGTH, FORCE, TIME, READING = 1e3, 2.0, 7.0, 5.0  # of new units in the old ones, inverse
+AT = Amplitudes(*(jnp.asarray(x) for x in (3.0, 0.02, 0.4, 1.7, 18.0, 10.0)))
+MOTION = Motion(*(jnp.asarray([x, -x]) for x in (0.03, 0.5, 0.01, 2.0, 600.0)))
+POWERS = {"exponent": jnp.asarray(1.7)}
+
+
+def in_new_units(at):
+    """Amplitudes where numbers of lengths, forces and times are larger by these factors."""
+    speed = LENGTH / TIME
+    factors = (FORCE, LENGTH, speed, READING, 1 / TIME, TIME)
+    return Amplitudes(*(x * f for x, f in zip(at, factors, strict=True)))
+
+
+def values(kind, at):
+    """Every parameter at 0.7 of its scale; an exponent as it is."""
+    return [
+        POWERS.get(p.name, 0.7 * s)
+        for p, s in zip(kind.parameters, scales(kind.name, at, POWERS), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_laws_see_no_units(name):
+    """Parameters at their scales do alike whatever the units, so each scale has the unit of its parameter."""
+    kind, new = CATALOGUE[name], in_new_units(AT)
+    factors = (LENGTH, LENGTH / TIME, LENGTH, TIME, FORCE / LENGTH)
+    moved = Motion(*(x * f for x, f in zip(MOTION, factors, strict=True)))
+    old, now = values(kind, AT), values(kind, new)
+    speed = jnp.abs(MOTION.velocity)
+    pairs = []
+    if kind.force is not None:
+        pairs.append((kind.force(MOTION, *old) * FORCE, kind.force(moved, *now)))
+    if kind.rate is not None:
+        pairs.append((kind.rate(MOTION, *old) * LENGTH / TIME, kind.rate(moved, *now)))
+    if kind.slip is not None:
+        pairs.append((kind.slip(speed, *old) * FORCE, kind.slip(speed * LENGTH / TIME, *now)))
+    if kind.changes is not None:
+        heavy, rubbing, stiff = FORCE * TIME**2 / LENGTH, FORCE * TIME / LENGTH, FORCE / LENGTH
+        nominal = Nominal(jnp.asarray(2.0), jnp.asarray(3.0), jnp.asarray(4.0))
+        there = Nominal(*(x * f for x, f in zip(nominal, (heavy, rubbing, stiff), strict=True)))
+        factors = (heavy, rubbing, stiff) * 2 + (1.0, READING, TIME, TIME, 1 / READING)
+        found = zip(kind.changes(nominal, *old), kind.changes(there, *now), factors, strict=True)
+        pairs += [(x * f, y) for x, y, f in found]
+    for expected, found in pairs:
+        np.testing.assert_allclose(found, expected, rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("prior", sorted({p.prior for kind in CATALOGUE.values() for p in kind.parameters}))
+def test_priors_are_distributions(prior):
+    steps = 200_001
+    low, high = prior.lowest, prior.highest
+    x = jnp.geomspace(low, high, steps) if prior.shape == "log-normal" else jnp.linspace(low, high, steps)
+    density = np.exp(np.asarray(jax.vmap(prior.log_density)(x)))
+    assert np.trapezoid(density, x) == pytest.approx(1.0, abs=1e-6)
+    assert prior.log_density(jnp.asarray(high + 1.0)) == -np.inf
+    assert np.isfinite(jax.grad(prior.log_density)(jnp.asarray(0.5 * (low + high))))
+    assert str(prior)
+
+
+def test_priors_keep_to_what_makes_sense():
+    for kind in CATALOGUE.values():
+        for p in kind.parameters:
+            assert p.prior.lowest >= p.lowest, f"{kind.name}.{p.name}"
+            assert p.raised is None or p.raised in {q.name for q in kind.parameters}
+
+
+def test_scales_in_symbols():
+    assert str(Scale(force=1, displacement=-3)) == "F d⁻³"
+    assert str(Scale()) == ""
+    assert str(Prior("uniform", 0.0, 1.0, -1.0, 1.0)) == "-1 to 1"
+
+
+def test_amplitudes_of_places():
+    """A joint carries its spring's and damper's force, a place without one what accelerates its ends."""
+    model = systems.three_dof()
+    bodies = model.bodies
+    places = [
+        ("coulomb_friction", (("between", (bodies[0], bodies[1])),), {"force": 1.0}),
+        ("coulomb_friction", (("between", (bodies[0], bodies[2])),), {"force": 1.0}),
+        ("constant_load", (("body", bodies[1]),), {"force": 1.0}),
+        ("sensor_bias", (("sensor", model.sensors[0].name),), {"offset": 1.0}),
+        ("input_gain", (("input", model.inputs[0].name),), {"factor": 1.0}),
+    ]
+    effects = [Effect(k, p, {n: jnp.asarray(v) for n, v in q.items()}) for k, p, q in places]
+    slots = slots_of(
+        jaxsid.lumped_model(
+            bodies, model.mass, model.stiffness, model.damping, connections=model.connections,
+            inputs=model.inputs, sensors=model.sensors, effects=effects,
+        )
+    )  # fmt: skip
+    linear, rng = second_order(model), np.random.default_rng(0)
+    x, v = rng.normal(size=(2, 400, len(bodies)))
+    u, y = rng.normal(size=(400, len(model.inputs))), rng.normal(size=(400, len(model.sensors)))
+    found = amplitudes(linear, slots, *(jnp.asarray(a) for a in (x, v, u, y)), 0.05)
+    M, D, K = (np.asarray(a) for a in (linear.mass, linear.damping, linear.stiffness))
+    rms = lambda a: np.sqrt((a**2).mean())  # noqa: E731
+    net = u @ np.asarray(linear.input_matrix).T - x @ K.T - v @ D.T
+    across = -K[0, 1] * (x[:, 1] - x[:, 0]) - D[0, 1] * (v[:, 1] - v[:, 0])
+    expected = [rms(across), rms(net[:, 2] - net[:, 0]) / 2, rms(net[:, 1])]
+    if K[0, 2] or D[0, 2]:
+        expected[1] = rms(-K[0, 2] * (x[:, 2] - x[:, 0]) - D[0, 2] * (v[:, 2] - v[:, 0]))
+    np.testing.assert_allclose(found.force[:3], expected)
+    np.testing.assert_allclose(found.displacement[0], rms(x[:, 1] - x[:, 0]))
+    np.testing.assert_allclose(found.velocity[2], rms(v[:, 1]))
+    np.testing.assert_allclose(found.signal[3:], [rms(y[:, 0]), rms(u[:, 0])])
+    slowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min())
+    np.testing.assert_allclose(found.rate, slowest)
