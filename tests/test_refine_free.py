@@ -156,6 +156,21 @@ def test_profile_on_the_edge_keeps_matrices_positive():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6, 10, 17, 19])
+def test_damping_on_the_edge_does_not_lead_away_from_the_best(seed):
+    """Where the best free matrices are not positive the fit still explains the data better than the truth does."""
+    truth = chain_model(THREE)
+    ir, noise, size = noisy(truth, 0.3, seed)
+    start = chain_model(THREE, factors(np.random.default_rng(100 + seed), THREE))
+    found = refine(start, ir, noise=noise, structure="free", validate=False)
+    assert any("damping (positive only just)" in x for x in found.warnings)
+    assert bool(found.converged)
+    h = np.asarray(ir.h)[:, :, 0]
+    own, true = ((((response(*triple(m), len(h)) - h) / size) ** 2).sum() for m in (found.model, truth))
+    assert own < true
+
+
 def test_what_is_known_holds_for_free_matrices_too():
     truth = chain_model(([1.2, 0.8], [3000.0, 2000.0], [1.5, 0.0]))
     ir, noise, _ = noisy(truth, 0.1, 2)

@@ -92,20 +92,23 @@ class MotionTerm(eqx.Module):
         """
 
         def improved(_: Array, found: tuple) -> tuple:
-            states, move, cost, part = found
+            states, difference, move, cost, part = found
             candidate = states - self._moved(part[:, None] * move)
-            r, j, _ = self._slopes(unknowns, theta, candidate, jnp.zeros((len(theta), 0), theta.dtype))
-            cost_new = (r**2).sum(axis=1)
+            new = self._slopes(unknowns, theta, candidate, jnp.zeros((len(theta), 0), theta.dtype))
+            cost_new = (new.residual**2).sum(axis=1)
             better = (cost_new < cost)[:, None]
-            move = jnp.where(better, _product(_pseudo_inverse(j), r), move)
+            move = jnp.where(better, _product(_pseudo_inverse(new.of_states), new.residual), move)
             part = jnp.where(better[:, 0], 1.0, SHORTER * part)
-            return jnp.where(better, candidate, states), move, jnp.minimum(cost, cost_new), part
+            states = jnp.where(better, candidate, states)
+            difference = jnp.where(better[:, None], new.difference, difference)
+            return states, difference, move, jnp.minimum(cost, cost_new), part
 
+        # what the rounds leave is kept: to simulate the best states once more is to compile the simulation twice
         windows, free = len(self.state), len(self.free)
-        nothing = jnp.zeros((windows, free), theta.dtype)
-        start = (self.state, nothing, jnp.full(windows, jnp.inf), jnp.ones(windows, theta.dtype))
-        states = lax.fori_loop(0, 2 * ROUNDS, improved, start)[0]
-        return Left(self.simulated(unknowns, theta, states) - self.y, states)
+        nothing, unknown = jnp.zeros((windows, free), theta.dtype), jnp.full_like(self.y, jnp.nan)
+        start = (self.state, unknown, nothing, jnp.full(windows, jnp.inf), jnp.ones(windows, theta.dtype))
+        states, difference, _, _, _ = lax.fori_loop(0, 2 * ROUNDS, improved, start)
+        return Left(difference, states)
 
     def projected(self, unknowns: LinearMatrices, theta: Array) -> tuple[Array, Array]:
         """Weighted residual (windows, k) and its Jacobian (windows, k, p), both without what initial states explain.
@@ -120,7 +123,7 @@ class MotionTerm(eqx.Module):
         def improved(_: Array, found: tuple) -> tuple:
             states, r, j, slopes, inverse, cost, part = found
             candidate = states - self._moved(part[:, None] * _product(inverse, r))
-            r_new, j_new, slopes_new = self._slopes(unknowns, theta, candidate, every)
+            _, r_new, j_new, slopes_new = self._slopes(unknowns, theta, candidate, every)
             cost_new = (r_new**2).sum(axis=1)
             better = cost_new < cost
             new = (candidate, r_new, j_new, slopes_new, _pseudo_inverse(j_new), cost_new, jnp.ones_like(part))
@@ -138,19 +141,19 @@ class MotionTerm(eqx.Module):
 
     def _slopes(
         self, unknowns: LinearMatrices, theta: Array, states: Array, along: Float[Array, "p directions"]
-    ) -> tuple[Array, Array, Array]:
-        """Weighted residual, its change with the initial states, and with theta along some directions."""
+    ) -> "_Slopes":
+        """What is left, and how it changes with the initial states, and with theta along some directions."""
         free = len(self.free)
 
-        def residual(move: Array) -> tuple[Array, Array]:
+        def residual(move: Array) -> tuple[Array, tuple[Array, Array]]:
             moved = theta + along @ move[free:]
-            y = self.simulated(unknowns, moved, states + self._moved(move[:free]))
-            r = self._weighted(y - self.y)
-            return r, r
+            left = self.simulated(unknowns, moved, states + self._moved(move[:free])) - self.y
+            r = self._weighted(left)
+            return r, (left, r)
 
         nothing = jnp.zeros(free + along.shape[1], states.dtype)
-        j, r = jax.jacfwd(residual, has_aux=True)(nothing)
-        return r, j[..., :free], j[..., free:]
+        j, (left, r) = jax.jacfwd(residual, has_aux=True)(nothing)
+        return _Slopes(left, r, j[..., :free], j[..., free:])
 
     def simulated(self, unknowns: LinearMatrices, theta: Array, states: Array) -> Array:
         """(windows, length, outputs).
@@ -200,6 +203,22 @@ class MotionTerm(eqx.Module):
 
 def _product(inverse: Float[Array, "windows n k"], r: Float[Array, "windows k"]) -> Float[Array, "windows n"]:
     return jnp.einsum("wnk,wk->wn", inverse, r)
+
+
+class _Slopes(NamedTuple):
+    """Simulated less measured, as rows of unit variance, and changes of these.
+
+    Attributes:
+        difference: (windows, length, outputs).
+        residual: (windows, k).
+        of_states: (windows, k, free) with the initial states.
+        of_unknowns: (windows, k, directions).
+    """
+
+    difference: Float[Array, "windows length outputs"]
+    residual: Float[Array, "windows k"]
+    of_states: Float[Array, "windows k free"]
+    of_unknowns: Float[Array, "windows k directions"]
 
 
 class Left(NamedTuple):

@@ -84,12 +84,15 @@ class Problem(NamedTuple):
 def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
     """Fits to all and to a part of the data, from the start that leads to the least misfit."""
     known, first = problem.known, problem.train or problem.every
-    best, least, starts = None, np.inf, problem.starts
-    if problem.scattered is not None:
+    best, least, starts, asked = None, np.inf, problem.starts, 0
+    if problem.scattered is not None and known.cone is not None:
+        # from where each begins: its free mode may lie far from all positive matrices, and the way back leads elsewhere
+        starts, asked = (*problem.scattered, *starts), len(problem.scattered)
+    elif problem.scattered is not None:
         every = from_each(first, known.unknowns, known.prior, problem.scattered, problem.solver)
         squares = np.where(np.isfinite(every.squares), every.squares, np.inf)
         starts = (every.theta[int(squares.argmin())], *starts)
-    for start in starts:
+    for number, start in enumerate(starts, 1):
         if len(starts) > 1 and not np.isfinite(float(squares_at(first, known.unknowns, start))):
             continue
         fit = within_bounds(first, known, start, problem.solver)
@@ -98,7 +101,7 @@ def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
             continue
         if squares < least:
             best, least = fit, squares
-        if problem.weighed and _good(squares, float(fit.posterior.equations)):
+        if problem.weighed and number >= asked and _good(least, float(fit.posterior.equations)):
             break
     if best is None:
         bad_input(
