@@ -8,7 +8,7 @@ import pytest
 from gap_helpers import DT, JOINT, SAMPLES, chain, drive, exact, noisy, record, with_effect
 from typer.testing import CliRunner
 
-from jaxsid import Effect, InputError, diagnose, read_model, write_model
+from jaxsid import Effect, InputError, Record, diagnose, read_model, write_model
 from jaxsid.cli import app
 from jaxsid.files.results_json import plain
 from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
@@ -122,6 +122,10 @@ def test_what_must_be_known_is_said():
     said = " ".join(found.warnings)
     assert "coulomb_friction) were left out" in said
     assert "larger than the signal itself" in said
+    few = Record(0 * u[:, None], y[:, :2], DT, inputs=("drive",), outputs=("s0", "s1"), name="quiet.csv")
+    said = " ".join(diagnose(chain(), few).warnings)
+    assert "quiet.csv: its inputs are zero throughout" in said
+    assert "Sensor 's2' is in none of the records" in said
     with pytest.raises(InputError, match="initial 'zero' is unknown"):
         diagnose(chain(), record(u, y), initial="zero")
 

@@ -194,6 +194,11 @@ def _warnings(
             f"The model is unstable (a pole at {poles.real.max():.3g} 1/s): a free run of it says nothing, so that "
             "misfits are those of windows of one period of its slowest motion."
         )
+    said += [
+        f"{record.name}: its inputs are zero throughout, so that it shows free motion and noise alone."
+        for record in records
+        if not np.asarray(record.u).any()
+    ]
     said += _about_sensors(model, found)
     if any(n.source == SOURCES[-1] for n in found.noises):
         said.append(
@@ -213,7 +218,10 @@ def _about_sensors(model: LumpedModel, found: Examination) -> list[str]:
         y, response = (
             np.concatenate([getattr(x, name)[:, j] for x in found.beside]) for name in ("measured", "refit")
         )
-        if not np.isfinite(y).any() or not found.before.nrmse[sensor.name] > 1:
+        if not np.isfinite(y).any():
+            said.append(f"Sensor '{sensor.name}' is in none of the records.")
+            continue
+        if found.before.nrmse[sensor.name] <= 1:
             continue
         there = np.isfinite(y)
         together = float(np.corrcoef(y[there], response[there])[0, 1])
