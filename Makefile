@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench bench-refine notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine bench-calibration notebooks clean
 
 setup: $(STAMP)
 
@@ -39,6 +39,9 @@ bench: $(STAMP) $(PEERS)/.installed
 
 bench-refine: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/refinement.py
+
+bench-calibration: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)
