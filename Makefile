@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench bench-refine bench-effects docs notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine bench-effects bench-calibration docs notebooks clean
 
 setup: $(STAMP)
 
@@ -42,6 +42,9 @@ bench-refine: $(STAMP)
 
 bench-effects: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/effects.py $(FIGURES)/effects-truth.npz
+
+bench-calibration: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)
