@@ -75,9 +75,8 @@ def drive(rng: np.random.Generator, samples: int, dt: float, band: float) -> tup
         lines = np.where((f > 0) & (f < band), np.exp(2j * np.pi * rng.random(len(f))), 0)
         u = np.resize(np.fft.irfft(lines, length), samples)
     elif kind == "random":
-        u = scipy.signal.lfilter(
-            *scipy.signal.butter(2, min(2 * band * dt, 0.95)), rng.standard_normal(samples)
-        )
+        low = scipy.signal.butter(2, min(2 * band * dt, 0.95), output="sos")
+        u = np.asarray(scipy.signal.sosfilt(low, rng.standard_normal(samples)))
     elif kind == "chirp":
         u = scipy.signal.chirp(t, band / 50, t[-1], band)
     else:
@@ -189,7 +188,7 @@ def _chain(mass: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _sampled(A: np.ndarray, B: np.ndarray, dt: float, hold: str) -> tuple[np.ndarray, ...]:
     """The states sampled, as outputs, since those of a first-order hold are shifted."""
     own = (A, B, np.eye(len(A)), np.zeros_like(B))
-    found = scipy.signal.cont2discrete(own, dt, method={"zero": "zoh", "first": "foh"}[hold])
+    found = list(scipy.signal.cont2discrete(own, dt, method={"zero": "zoh", "first": "foh"}[hold]))  # pyright: ignore
     return tuple(np.asarray(x) for x in found[:4])
 
 

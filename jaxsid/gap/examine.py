@@ -20,7 +20,7 @@ from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.records import Record, as_array
 
 SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
-FAR = 4.0  # times less that a free refit leaves than one within the tolerance, from which on places are sought about it
+FAR = 10.0  # times less that a refit leaves, from which on the tolerance may be wrong
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 
 
@@ -147,7 +147,7 @@ def examine(
         before=gaps[0],
         recalibrated=gaps[1],
         refit=freely.model,
-        locations=locate(model, records, noises=noises, refit=_far(within, freely)) if structural else None,
+        locations=_located(model, records, nothing, after) if structural else None,
         noises=noises,
         elements=_values(model, freely),
         beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
@@ -176,6 +176,16 @@ def _beside(nominal: Recalibrated, refit: Recalibrated, number: int) -> Beside:
     return Beside(y, *(y - x for x in left))
 
 
-def _far(within: Recalibrated, freely: Recalibrated) -> LumpedModel | None:
-    """The refitted model, where it explains so much more that the tolerance may be wrong."""
-    return freely.model if within.squares > FAR * freely.squares else None
+def _located(
+    model: LumpedModel, records: tuple[Record, ...], nothing: Recalibrated, after: Recalibrated
+) -> Locations:
+    found = locate(model, records, noises=nothing.noises)
+    ratio = math.sqrt(nothing.squares / max(after.squares, 1e-300))
+    if ratio < FAR:
+        return found
+    remark = (
+        f"A refitted linear model leaves {ratio:.2g} times less than the nominal one. Unless the effect does that, "
+        "its parameters lie beyond their tolerance and the places are not to be trusted: "
+        "run identify first, and diagnose with the model that it writes."
+    )
+    return found._replace(remarks=(*found.remarks, remark))

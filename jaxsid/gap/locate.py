@@ -11,7 +11,6 @@ from jaxsid.gap.apart import COMPARED, expected_differences, same_force, sets_of
 from jaxsid.gap.force_map import ForceMap, force_map
 from jaxsid.gap.noise import Noise, deviations, noise_of
 from jaxsid.gap.places import Place, places_of
-from jaxsid.gap.recalibrate import WIDE
 from jaxsid.gap.scoring import Scores, scores
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import spectra_of
@@ -56,7 +55,6 @@ class Locations(NamedTuple):
         maps: the force over time at the most probable of them, one a record.
         noises: of each record.
         remarks: what is to be known about it.
-        about: the model beside which that holds: the nominal one, or the refitted one.
     """
 
     ranked: tuple[Location, ...]
@@ -64,7 +62,6 @@ class Locations(NamedTuple):
     maps: tuple[ForceMap, ...]
     noises: tuple[Noise, ...]
     remarks: tuple[str, ...]
-    about: LumpedModel
 
 
 def locate(
@@ -73,7 +70,6 @@ def locate(
     *,
     noises: Sequence[Noise] | None = None,
     places: Sequence[Place] | None = None,
-    refit: LumpedModel | None = None,
 ) -> Locations:
     """The places where one force, or one error of a signal, explains what a model leaves of records.
 
@@ -87,9 +83,6 @@ def locate(
         records: one or several, each with some of the model's sensors.
         noises: one a record; None finds them.
         places: which to compare; None for all pairs of ends, sensors and inputs.
-        refit: the model with refitted parameters. Where given, places are also compared about it, with parameters that
-            hardly anything is known of, and the better of both explanations counts: an effect beside parameters that
-            are far beyond their tolerance, which would else be mistaken for an effect.
 
     Returns:
         Locations.
@@ -108,39 +101,23 @@ def locate(
     # a sensor that no record has cannot be at fault
     seen = {name for r in records for name in r.outputs}
     compared = tuple(p for p in compared if p.where != "sensor" or p.ends[0] in seen)
-    found = _compared(model, records, noises, compared, model.tolerance._asdict())
-    if refit is not None:
-        other = _compared(refit, records, noises, compared, WIDE)
-        found = max(found, other, key=lambda x: float(x.scores.best.max()))
-    return _concluded(found, noises, compared)
-
-
-class _Compared(NamedTuple):
-    """Places beside one model."""
-
-    model: LumpedModel
-    settings: list[Setting]
-    scores: Scores
-
-
-def _compared(
-    model: LumpedModel,
-    records: tuple[Record, ...],
-    noises: tuple[Noise, ...],
-    places: tuple[Place, ...],
-    tolerance: dict[str, float],
-) -> _Compared:
     directions, rate = element_directions(model), slowest_rate(model)
     settings = []
     for record, noise in zip(records, noises, strict=True):
         spectra = spectra_of(model, record)
         settings.append(setting_of(spectra, deviations(noise, spectra), directions, rate))
-    deviation = np.array([tolerance[x.quantity] for x in element_matrices(model).listed])
-    return _Compared(model, settings, scores(model, settings, places, deviation))
+    tolerance = np.array([getattr(model.tolerance, x.quantity) for x in element_matrices(model).listed])
+    found = scores(model, settings, compared, tolerance)
+    return _concluded(model, settings, noises, compared, found)
 
 
-def _concluded(by: _Compared, noises: tuple[Noise, ...], places: tuple[Place, ...]) -> Locations:
-    model, settings, found = by
+def _concluded(
+    model: LumpedModel,
+    settings: list[Setting],
+    noises: tuple[Noise, ...],
+    places: tuple[Place, ...],
+    found: Scores,
+) -> Locations:
     value = _with_ties(found, places)
     order = [int(i) for i in np.argsort(-value, kind="stable")]
     same, alike = same_force(model, places), _alike(settings, found, value, order)
@@ -163,9 +140,7 @@ def _concluded(by: _Compared, noises: tuple[Noise, ...], places: tuple[Place, ..
         for i in likely[:MOST_MAPS]
         for number, (setting, made, noise) in enumerate(zip(settings, found.explained, noises, strict=True))
     )
-    return Locations(
-        ranked, tuple(places[i] for i in likely), maps, noises, _remarks(across, likely, places), model
-    )
+    return Locations(ranked, tuple(places[i] for i in likely), maps, noises, _remarks(across, likely, places))
 
 
 def _alike(
@@ -224,7 +199,12 @@ def _remarks(across: np.ndarray, likely: Sequence[int], places: tuple[Place, ...
             "noise. There may be several effects, or errors of the linear parameters beyond their tolerance."
         )
     if len(likely) > 1:
-        said.append(
-            f"These records do not tell apart: {', '.join(places[i].label for i in likely)}. Another sensor would."
+        same = "input" in {places[i].where for i in likely}
+        way = (
+            "What an input does wrong is a force to every sensor, so that only its shape tells."
+            if same
+            else ""
         )
+        labels = ", ".join(places[i].label for i in likely)
+        said.append(f"These records do not tell apart: {labels}. {way or 'Another sensor would.'}")
     return tuple(said)
