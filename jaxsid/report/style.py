@@ -25,6 +25,7 @@ CSS_COLOURS = {
 }
 WIDTH = 4.4  # inches, narrow enough that its text is legible on a phone
 FONT = 9.0  # points
+MARKS = 5  # intervals of a linear axis, at most
 
 
 def new_figure(
@@ -74,6 +75,7 @@ def shortened(text: str, most: int = 44) -> str:
 
 def style_axes(ax: Axes) -> None:
     ax.set_facecolor("none")
+    ax.locator_params(nbins=MARKS)  # marks and their numbers take most of the time of a figure
     ax.tick_params(labelsize=FONT - 0.5, colors=MUTED, length=2.5, width=0.6)
     for side, spine in ax.spines.items():
         spine.set_visible(side in ("left", "bottom"))
