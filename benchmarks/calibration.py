@@ -134,7 +134,7 @@ def rubbing() -> str:
     from effects_truth import Chain, Truth  # of the tests
 
     dt, samples, system = 2e-3, 800, System([1.0, 1.2], [900, 700], [3, 2], kinds="ad")
-    u = band_noise(np.random.default_rng(0), samples, 1, dt, 0.5, 20.0)
+    u = band_noise(np.random.default_rng(1), samples, 1, dt, 0.5, 20.0)
     u = 12 * u / u.std()
     sensors = tuple((i, KINDS[kind]) for i, kind in enumerate(system.sensors))
     M, D, K = matrices(system)
