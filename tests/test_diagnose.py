@@ -130,6 +130,7 @@ def test_what_must_be_known_is_said():
         diagnose(chain(), record(u, y), initial="zero")
 
 
+@pytest.mark.slow
 def test_an_unstable_model_is_judged_by_windows():
     u = drive()
     model = lumped_model(

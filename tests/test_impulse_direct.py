@@ -73,6 +73,7 @@ def test_white_excitation_with_noise(dt):
     np.testing.assert_allclose(ir.noise_std, 0.01 * np.asarray(record.y).std(axis=0), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_several_inputs_at_once():
     """Three records with all inputs acting determine nine responses as one record does one."""
     records = [white(seed=i, samples=1500) for i in range(3)]

@@ -151,6 +151,7 @@ def test_effects_of_no_size_change_nothing():
     assert error(jaxsid.simulate(chain(none), record(u)), linear) < 1e-9
 
 
+@pytest.mark.slow
 def test_several_effects_in_any_order_and_direction():
     u = drive(500)
     one = effect("coulomb_friction", JOINT, {"force": 2.0})
@@ -238,8 +239,8 @@ def values_of(model, u, **parameters):
             marks=pytest.mark.slow,
         ),
         pytest.param("backlash", JOINT, {"half_gap": 0.002}, marks=pytest.mark.slow),
-        ("input_delay", 0, {"delay": 0.0034}),
-        pytest.param("sensor_lag", 0, {"time_constant": 0.004}, marks=pytest.mark.slow),
+        pytest.param("input_delay", 0, {"delay": 0.0034}, marks=pytest.mark.slow),
+        ("sensor_lag", 0, {"time_constant": 0.004}),
         pytest.param(
             "missing_mode", 1, {"mass": 0.2, "stiffness": 300.0, "damping": 0.5}, marks=pytest.mark.slow
         ),

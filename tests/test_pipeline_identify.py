@@ -186,6 +186,7 @@ def test_noise_free_records_give_nearly_exact_matrices(model):
     assert max(found.train_nrmse) < 1e-5
 
 
+@pytest.mark.slow
 def test_records_of_different_lengths_and_states_are_used_together(model):
     rng = np.random.default_rng(4)
     records = []
@@ -245,6 +246,7 @@ def test_linear_hold():
     check(found, SYSTEM, Limits(1e-6, 1e-5, 1e-5, 1e-4))
 
 
+@pytest.mark.slow
 def test_band_limited_hold():
     model = nominal(SYSTEM, hold="band")
     u, y = periodic(SYSTEM, np.random.default_rng(8), 20000, 32768)

@@ -74,6 +74,7 @@ def test_deviations_are_those_of_the_errors_whether_the_noise_is_known_or_not():
         assert np.abs(sample.mean(axis=0)).max() < 0.6
 
 
+@pytest.mark.slow
 def test_coloured_noise_that_is_known_is_weighed_and_covered():
     colour = 0.9 ** np.arange(400)[:, None] * SIZE**2
     noise = StationaryNoise(jnp.asarray(colour))

@@ -171,6 +171,7 @@ def test_damping_on_the_edge_does_not_lead_away_from_the_best(seed):
     assert own < true
 
 
+@pytest.mark.slow
 def test_what_is_known_holds_for_free_matrices_too():
     truth = chain_model(([1.2, 0.8], [3000.0, 2000.0], [1.5, 0.0]))
     ir, noise, _ = noisy(truth, 0.1, 2)

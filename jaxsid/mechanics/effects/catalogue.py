@@ -193,7 +193,7 @@ def slips(kinds: Numbers, parameters: Float[Array, "slots most"], speed: Array) 
 def rubbing(kinds: Numbers) -> Bool[Array, " slots"] | Bool[np.ndarray, " slots"]:
     """Which slots are dry friction, whatever its magnitude."""
     if isinstance(kinds, Sorted):
-        return np.array([sort == "dry" for sort in kinds.sorts])
+        return np.array([sort == "dry" for sort in kinds.sorts], bool)
     numbers = [kind_number(kind.name) for kind in CATALOGUE.values() if kind.slip is not None]
     return (np if isinstance(kinds, np.ndarray) else jnp).isin(kinds, np.array(numbers))
 
