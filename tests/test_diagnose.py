@@ -11,7 +11,9 @@ from typer.testing import CliRunner
 from jaxsid import Effect, InputError, Record, diagnose, read_model, write_model
 from jaxsid.cli import app
 from jaxsid.files.results_json import plain
+from jaxsid.gap.diagnose import element_place
 from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
+from jaxsid.physical.elements import Element, element_matrices
 from jaxsid.report.diagnosis_page import diagnosis_page
 from jaxsid.report.diagnosis_summary import print_diagnosis
 from jaxsid.report.plots.places import map_figure
@@ -87,6 +89,20 @@ def test_wrong_numbers_are_named():
     for x in selected:
         factor = x["parameters"]["factor"]
         assert abs(factor["value"] - 1 / 1.05) < 5 * factor["std"]
+
+
+def test_places_of_numbers_have_two_ends_or_a_body_for_matrices_too():
+    assert element_place(chain(), Element("c1", "damping")) == {"between": ["ground", "b1"]}
+    assert element_place(chain(), Element("b2", "mass")) == {"body": "b2"}
+    matrices = Matrices(*(jnp.eye(2) + k * jnp.array([[1.0, -1.0], [-1.0, 1.0]]) for k in (0.0, 0.1, 5.0)))
+    model = lumped_model(
+        ["a", "b"], matrices=matrices, inputs=[Input("f", "a")], sensors=[Sensor("s", "a", "velocity")]
+    )
+    places = [element_place(model, x) for x in element_matrices(model).listed]
+    assert {"body": "a"} in places
+    assert {"between": ["a", "b"]} in places
+    assert {"between": ["ground", "b"]} in places
+    assert all(len(x["between"]) == 2 for x in places if "between" in x)
 
 
 def test_the_command(tmp_path):

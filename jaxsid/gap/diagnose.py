@@ -9,7 +9,8 @@ from jaxsid.checks import require
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.noise import SOURCES
 from jaxsid.mechanics.first_order import physical_displacement_velocity
-from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.mechanics.lumped import GROUND, LumpedModel, second_order
+from jaxsid.physical.elements import Element
 from jaxsid.records import Record
 
 VERDICTS = {"agreement": "none", "parameters": "effect", "structure": "unknown"}
@@ -127,16 +128,12 @@ class Diagnosis(NamedTuple):
         """Errors of the model's own numbers, where these explain the gap: those that stand out."""
         if self.verdict != "effect":
             return []
-        ends = {c.name: list(c.between) for c in self.nominal.connections}
         found = []
         for element, row in zip(self.examination.elements.listed, self._elements(), strict=True):
             nominal, std = row["nominal"], row["std"]
             if nominal == 0 or abs(row["value"] - nominal) < SURE * std:
                 continue
-            body = element.quantity == "mass"
-            place = (
-                {"body": element.element} if body else {"between": ends.get(element.element, element.element)}
-            )
+            place = element_place(self.nominal, element)
             factor = {"value": row["value"] / nominal, "std": std / abs(nominal), "unit": ""}
             kind = KINDS[element.quantity]
             found.append((abs(factor["value"] - 1) / factor["std"], kind, place, factor))
@@ -145,6 +142,22 @@ class Diagnosis(NamedTuple):
             {"kind": kind, "place": place, "parameters": {"factor": factor}, "gap_after": gap}
             for _, kind, place, factor in sorted(found, key=lambda x: -x[0])
         ]
+
+
+def element_place(model: LumpedModel, element: Element) -> dict[str, Any]:
+    """Where a number of a model acts, as in diagnosis.json.
+
+    Args:
+        model: elements, or matrices, whose numbers bear the names of the bodies that they join.
+        element: one of its numbers.
+    """
+    for connection in model.connections:
+        if element.quantity != "mass" and element.element == connection.name:
+            return {"between": list(connection.between)}
+    ends = element.element.split(", ") if model.matrices is not None else [element.element]
+    if len(ends) > 1:
+        return {"between": ends}
+    return {"body": ends[0]} if element.quantity == "mass" else {"between": [GROUND, *ends]}
 
 
 def diagnose(
