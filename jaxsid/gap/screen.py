@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxsid.checks import require
 from jaxsid.gap.dictionary import products, sizes
@@ -74,7 +74,7 @@ def screen(
     places: tuple[Place, ...],
     motions: Mapping[str, Sequence[Motion]],
     tolerance: Float[np.ndarray, " e"],
-    left: Sequence[Float[np.ndarray, "lines outputs"]],
+    left: Sequence[Complex[np.ndarray, "_ _"]],
     *,
     kinds: Sequence[str] | None = None,
 ) -> tuple[Candidate, ...]:
@@ -239,7 +239,7 @@ def _counting(own: Float[np.ndarray, "grid k k"]) -> Float[np.ndarray, "grid k"]
 
 
 def lone_frequencies(
-    settings: Sequence[Setting], left: Sequence[Float[np.ndarray, "lines outputs"]]
+    settings: Sequence[Setting], left: Sequence[Complex[np.ndarray, "_ _"]]
 ) -> Float[np.ndarray, " f"]:
     """Frequencies, Hz, about the lines that stand out most from those around them.
 
