@@ -304,24 +304,32 @@ def _passed(kind: Kind, place: Place, p: Array, where: str) -> Complex[Array, "p
     x = jnp.fft.irfft(whole * np.sqrt(count), count)
     cut = jnp.where(limit > 0, _lines(jnp.clip(x, -limit, limit)) - whole, jnp.zeros_like(whole))
     offset = jnp.zeros_like(whole).at[0].set(change.offset * np.sqrt(count))
-    before = 0.0 if where == "input" else _at_start(place.smooth, count)
-    late = lambda lines: (1 + change.gain) * _arrived(lines, before, change, dt, count)  # noqa: E731
-    given = place.smooth + cut
+    given, t = place.smooth + cut, dt * jnp.arange(count)
     if where == "input":
         follows = jnp.where((place.jumping != 0).any(), held, smoothly)
-        return jnp.stack([late(smoothly * given), late(follows * given)]) - whole + offset
-    return (late(smoothly * given + held * place.jumping) - whole + offset)[None]
+        late = [
+            (1 + change.gain) * _arrived(f * given, 0.0, 0.0, change, dt, count) for f in (smoothly, follows)
+        ]
+        return jnp.stack(late) - whole + offset
+    # a slope takes out the jump from a record's end to its start, which would ring
+    read = jnp.fft.irfft(given * np.sqrt(count), count)
+    slope = (2 * read[-1] - read[-2] - read[0]) / (count * dt)
+    lines = smoothly * (given - _lines(slope * t)) + held * place.jumping
+    return ((1 + change.gain) * _arrived(lines, slope, read[0], change, dt, count) - whole + offset)[None]
 
 
 def _at_start(lines: Array, count: int) -> Array:
     return jnp.fft.irfft(lines * np.sqrt(count), count)[0]
 
 
-def _arrived(lines: Array, before: Array | float, change: Changes, dt: Array, count: int) -> Array:
+def _arrived(
+    lines: Array, slope: Array | float, before: Array | float, change: Changes, dt: Array, count: int
+) -> Array:
     """The same, but with one value before a record began, instead of what wrapped around its end."""
     x, t = jnp.fft.irfft(lines * np.sqrt(count), count), dt * jnp.arange(count)
     since, lagging = t - change.delay, change.lag > 0
+    x = x + slope * (since - change.lag)
     first = jnp.interp(change.delay, t, x)
     fades = jnp.exp(-jnp.maximum(since, 0.0) / jnp.where(lagging, change.lag, 1.0))
     x = x + jnp.where(lagging, (before - first) * fades, 0.0)
-    return jnp.where(lagging | (change.delay > 0), _lines(jnp.where(since < 0, before, x)), lines)
+    return _lines(jnp.where(since < 0, before, x))
