@@ -1,7 +1,7 @@
 """What every kind of effect would add to a record's lines, were it there, on a motion that is held for true.
 
-One program serves all kinds of one sort of place. A kind is asked for its law, its friction, its memory and its changes;
-what these do to the motion of its place, transformed and passed through the nominal transfer, are its columns.
+One program serves all kinds of one sort of place. A kind is asked for its law, its friction, its memory and its
+changes; what these do to the motion of its place, transformed and passed through the nominal transfer, are its columns.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
 from jaxsid.gap.setting import Setting
-from jaxsid.gap.spectra import Motion, Spectra, in_time, parameter_columns, readings, to_lines
+from jaxsid.gap.spectra import Motion, Spectra, in_time, parameter_columns, readings
 from jaxsid.mechanics.amplitudes import amplitudes
 from jaxsid.mechanics.effects import kind as kinds
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -103,7 +103,8 @@ def products(
         place = _place(spectra, slot, nominal, motion, jumps, where)
         transfers = _transfers(spectra, slot, where) * given.scale[:, :, None]
         near = _Near(beside * given.scale[:, :, None], transfers, len(given.transient))
-        return {name: near.products(_signals(CATALOGUE[name], place, p, where)) for name, p in probes.items()}
+        signals = {name: _signals(CATALOGUE[name], place, p, where) for name, p in probes.items()}
+        return near.of_each(signals)
 
     return lax.map(one, (slots, nominal, motion, dict(probes)))
 
@@ -144,6 +145,16 @@ class _Near:
 
     def _halved(self, rows: Array) -> Array:
         return jax.scipy.linalg.solve_triangular(self.lower, rows, lower=True)
+
+    def of_each(self, signals: Mapping[str, Array]) -> dict[str, Products]:
+        """Of kinds with as many columns at once, for the sake of a short program."""
+        found = {}
+        for count in {x.shape[1] for x in signals.values()}:
+            names = [n for n, x in signals.items() if x.shape[1] == count]
+            gram = self.products(jnp.concatenate([signals[n] for n in names])).gram
+            ends = np.cumsum([len(signals[n]) for n in names])[:-1]
+            found |= dict(zip(names, map(Products, jnp.split(gram, ends)), strict=True))
+        return found
 
     def products(self, signals: Complex[Array, "grid k ports lines"]) -> Products:
         cross = 2 * jnp.einsum("gktl,tlb->gkb", signals.conj(), self.along).real
@@ -225,19 +236,33 @@ def _pushed(kind: Kind, place: Place, memory: Array | None, p: Array) -> Complex
         return lines
     change = _full(kind.changes(place.nominal, *p[:-1]))
     weights = jnp.stack([change.stiffness, change.damping, change.mass])
-    return lines - place.motion @ weights - _attached(change, place.omega) * place.motion[:, 0]
+    return lines - place.motion @ weights + _attached(change, place, len(d))
 
 
 def _full(change: Changes) -> Changes:
     return Changes(*(jnp.asarray(x) for x in change))
 
 
-def _attached(change: Changes, omega: Array) -> Array:
-    """What holds a body back, next to its displacement, where a mass hangs on it: its own motion is solved for."""
-    joint = change.attached_stiffness + 1j * omega * change.attached_damping
-    inertia = change.attached_mass * omega**2
-    below = joint - inertia
-    return -joint * inertia / jnp.where(below == 0, 1.0, below)
+def _attached(change: Changes, place: Place, count: int) -> Complex[Array, " lines"]:
+    """The pull of a mass that hangs on a body and begins where that is, at its speed; exact between the lines too."""
+    jw, heavy = 1j * place.omega, change.attached_mass > 0
+    mass = jnp.where(heavy, change.attached_mass, 1.0)
+    square, drag = change.attached_stiffness / mass, change.attached_damping / mass
+    joint, below = square + jw * drag, square + jw * drag + jw**2
+    moved = joint / jnp.where(below == 0, 1.0, below) * place.motion[:, 0]
+    # relative to the solution that repeats, what is left of the start swings freely
+    y = -_at_start(moved - place.motion[:, 0], count)
+    v = -_at_start(jw * moved - place.motion[:, 1], count)
+    root = jnp.sqrt((0.25 * drag**2 - square).astype(jw.dtype))
+    root = jnp.where(jnp.abs(root) > 0, root, 1e-6)
+    fast, slow = -0.5 * drag + root, -0.5 * drag - root
+    t = place.dt * jnp.arange(count)
+    one, other = (v - slow * y) / (2 * root), (fast * y - v) / (2 * root)
+    freely = one * (square + drag * fast) * jnp.exp(fast * t) + other * (square + drag * slow) * jnp.exp(
+        slow * t
+    )
+    pull = joint * (moved - place.motion[:, 0]) + _lines(freely.real)
+    return jnp.where(heavy, mass * pull, 0.0)
 
 
 def _memory(kind: Kind, place: Place, p: Array) -> Float[Array, " samples"]:
@@ -272,20 +297,39 @@ def _passed(kind: Kind, place: Place, p: Array, where: str) -> Complex[Array, "p
     keeps = jnp.where(lagging, jnp.exp(-dt / jnp.where(lagging, change.lag, 1.0)), 0.0)
     held = jnp.where(lagging, (1 - keeps) / (z - keeps), 1.0) * z ** -jnp.ceil(change.delay / dt)
     count = place.samples.shape[0]
-    limit = jnp.where(change.inverse_limit > 0, 1 / jnp.where(change.inverse_limit > 0, change.inverse_limit, 1), 0)
+    limit = jnp.where(
+        change.inverse_limit > 0, 1 / jnp.where(change.inverse_limit > 0, change.inverse_limit, 1), 0
+    )
     whole = place.smooth if where == "input" else place.smooth + place.jumping
     x = jnp.fft.irfft(whole * np.sqrt(count), count)
     cut = jnp.where(limit > 0, _lines(jnp.clip(x, -limit, limit)) - whole, jnp.zeros_like(whole))
     offset = jnp.zeros_like(whole).at[0].set(change.offset * np.sqrt(count))
-    late = lambda lines: (1 + change.gain) * _arrived(lines, change.delay / dt, count)  # noqa: E731
-    given = place.smooth + cut
+    given, t = place.smooth + cut, dt * jnp.arange(count)
     if where == "input":
         follows = jnp.where((place.jumping != 0).any(), held, smoothly)
-        return jnp.stack([late(smoothly * given), late(follows * given)]) - whole + offset
-    return (late(smoothly * given + held * place.jumping) - whole + offset)[None]
+        late = [
+            (1 + change.gain) * _arrived(f * given, 0.0, 0.0, change, dt, count) for f in (smoothly, follows)
+        ]
+        return jnp.stack(late) - whole + offset
+    # a slope takes out the jump from a record's end to its start, which would ring
+    read = jnp.fft.irfft(given * np.sqrt(count), count)
+    slope = (2 * read[-1] - read[-2] - read[0]) / (count * dt)
+    lines = smoothly * (given - _lines(slope * t)) + held * place.jumping
+    return ((1 + change.gain) * _arrived(lines, slope, read[0], change, dt, count) - whole + offset)[None]
 
 
-def _arrived(lines: Array, late: Array, count: int) -> Array:
-    """The same, but nothing arrives before a record began: what wrapped around its end is left out."""
-    x = jnp.fft.irfft(lines * np.sqrt(count), count)
-    return jnp.where(late > 0, _lines(jnp.where(jnp.arange(count) < late, 0.0, x)), lines)
+def _at_start(lines: Array, count: int) -> Array:
+    return jnp.fft.irfft(lines * np.sqrt(count), count)[0]
+
+
+def _arrived(
+    lines: Array, slope: Array | float, before: Array | float, change: Changes, dt: Array, count: int
+) -> Array:
+    """The same, but with one value before a record began, instead of what wrapped around its end."""
+    x, t = jnp.fft.irfft(lines * np.sqrt(count), count), dt * jnp.arange(count)
+    since, lagging = t - change.delay, change.lag > 0
+    x = x + slope * (since - change.lag)
+    first = jnp.interp(change.delay, t, x)
+    fades = jnp.exp(-jnp.maximum(since, 0.0) / jnp.where(lagging, change.lag, 1.0))
+    x = x + jnp.where(lagging, (before - first) * fades, 0.0)
+    return _lines(jnp.where(since < 0, before, x))

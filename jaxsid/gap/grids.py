@@ -22,7 +22,11 @@ from jaxsid.mechanics.effects.prior import Amplitudes, Prior
 COUNTS = {0: (), 1: (15,), 2: (15, 4), 3: (4, 3, 2)}  # points of each shape parameter, by how many there are
 WIDTHS = (0.02, 0.1)  # of the smoothed sign of dry friction, next to the rms velocity
 LINEAR_CHANGES = ("mass", "damping", "stiffness", "gain", "offset")
-SIGNALS = (-3, -2, -1)  # the changes of a signal that it is not proportional to, last of all: delay, lag, limit
+SIGNALS = (
+    -3,
+    -2,
+    -1,
+)  # the changes of a signal that it is not proportional to, last of all: delay, lag, limit
 LOOSE = 0.5  # deviation of the factor of a column that has no linear parameter
 
 
@@ -171,8 +175,11 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
         hertz: frequencies to try, for parameters in Hz.
     """
     kind, plan = CATALOGUE[name], plan_of(name)
-    counts = COUNTS.get(len(plan.shape), (3, 2) + (2,) * (len(plan.shape) - 2))
-    axes = [_axis(kind.parameters[i], c, i == plan.frequency, hertz) for i, c in zip(plan.shape, counts)]
+    counts = COUNTS.get(len(plan.shape), (3,) + (2,) * (len(plan.shape) - 1))
+    axes = [
+        hertz if i == plan.frequency else quantiles(kind.parameters[i].prior, count)
+        for i, count in zip(plan.shape, counts, strict=True)
+    ]
     widths = WIDTHS if kind.slip is not None else WIDTHS[:1]
     points = np.array([[*x, w] for *x, w in product(*axes, widths)])
     scale = np.array([np.asarray(p.scale.of(at)) * np.ones(len(at.rate)) for p in kind.parameters])
@@ -198,10 +205,6 @@ def _number(kind: Kind, name: str) -> int:
     return [p.name for p in kind.parameters].index(name)
 
 
-def _axis(parameter: Parameter, count: int, frequency: bool, hertz: np.ndarray) -> np.ndarray:
-    return hertz if frequency else quantiles(parameter.prior, count)
-
-
 def _grid(kind: Kind, plan: Plan, base: np.ndarray, scale: np.ndarray, widths: np.ndarray) -> Grid:
     linear, turns = plan.linear, (0.0, np.pi / 2) if plan.angle is not None else (None,)
     columns = len(linear) * len(turns) if linear else 1
@@ -219,7 +222,9 @@ def _grid(kind: Kind, plan: Plan, base: np.ndarray, scale: np.ndarray, widths: n
         probes[..., j, i] += step[..., j]
         spread[j] = 1.0
         if turn is None:
-            least = np.maximum(p.lowest, p.prior.lowest * scale[i] if p.prior.shape == "normal" else -np.inf + 0 * scale[i])
+            least = np.maximum(
+                p.lowest, p.prior.lowest * scale[i] if p.prior.shape == "normal" else -np.inf + 0 * scale[i]
+            )
             low[..., j] = (least[:, None] - base[..., i]) / step[..., j]
             high[..., j] = (p.prior.highest * scale[i][:, None] - base[..., i]) / step[..., j]
         else:

@@ -1,10 +1,10 @@
 """Which kinds of effects at which places deserve a refit by simulation.
 
-For a kind at a place the lines of what a model leaves are r = sum_i c_i b_i + sum_j l_j g_j + T t + noise: b_i the errors
-of the linear parameters within the model's tolerance, g_j the kind's columns on a motion that is held for true, t what
-a record's ends add. All is linear once the kind's shape parameters are given, so that its evidence is closed, and these
-run over a grid. Two motions are tried: the one that a force at the place implies, which is near where the gap is
-large, and that of a refitted linear model, which no noise has touched.
+For a kind at a place the lines of what a model leaves are r = sum_i c_i b_i + sum_j l_j g_j + T t + noise: b_i the
+errors of the linear parameters within the model's tolerance, g_j the kind's columns on a motion that is held for true,
+t what a record's ends add. All is linear once the kind's shape parameters are given, so that its evidence is closed,
+and these run over a grid. Two motions are worth trying: the one that a force at the place implies, which is near where
+the gap is large, and that of a refitted linear model, which no noise has touched.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxsid.checks import require
 from jaxsid.gap.dictionary import products, sizes
@@ -33,7 +33,6 @@ FREQUENCIES = 15  # tried for a disturbance
 BESIDE = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a line, in lines: where between them a frequency may lie
 AROUND = 8  # lines on either side that a lone one is compared with
 PARALLEL = 1e-9  # one less squared cosine between columns of which only the first counts
-OWN, REFIT = "force at the place", "refitted model"
 
 
 class Candidate(NamedTuple):
@@ -75,7 +74,7 @@ def screen(
     places: tuple[Place, ...],
     motions: Mapping[str, Sequence[Motion]],
     tolerance: Float[np.ndarray, " e"],
-    left: Sequence[Float[np.ndarray, "lines outputs"]],
+    left: Sequence[Complex[np.ndarray, "_ _"]],
     *,
     kinds: Sequence[str] | None = None,
 ) -> tuple[Candidate, ...]:
@@ -156,10 +155,10 @@ def _of_sort(
     grids = {n: grid_of(n, size, hertz) for n in names}
     probes = {n: jnp.asarray(g.probes) for n, g in grids.items()}
     jumps = jnp.asarray([float(i.hold == "zero") for i in model.inputs])
-    parts = [
-        products(s, at.slots, m, jumps, probes, at.where) for s, m in zip(settings, moved, strict=True)
-    ]
-    equations = sum(int((2 * np.asarray(s.spectra.weight)[:, None] * (np.asarray(s.scale) > 0)).sum()) for s in settings)
+    parts = [products(s, at.slots, m, jumps, probes, at.where) for s, m in zip(settings, moved, strict=True)]
+    equations = sum(
+        int((2 * np.asarray(s.spectra.weight)[:, None] * (np.asarray(s.scale) > 0)).sum()) for s in settings
+    )
     found = []
     for name in names:
         gram = np.sum([np.asarray(p[name].gram) for p in parts], axis=0)
@@ -179,7 +178,7 @@ def _together(settings: Sequence[Setting], each: list[Amplitudes]) -> Amplitudes
     weight = np.array([s.spectra.samples for s in settings], float)
     values = [np.stack([np.asarray(x) for x in field]) for field in zip(*each, strict=True)]
     mean = [np.sqrt(np.average(x**2, axis=0, weights=weight)) for x in values]
-    return Amplitudes(*mean)
+    return Amplitudes(*map(jnp.asarray, mean))
 
 
 def _allowed(model: LumpedModel, at: _Rows, name: str) -> list[int]:
@@ -196,7 +195,9 @@ def _candidate(
 ) -> Candidate | None:
     """The best point of a kind's grid at one place; None where it does nothing there."""
     k, points = len(grid.spread), len(gram)
-    prior = np.concatenate([grid.spread * _counting(gram[:, :k, :k]), np.tile(tolerance, (points, 1))], axis=1)
+    prior = np.concatenate(
+        [grid.spread * _counting(gram[:, :k, :k]), np.tile(tolerance, (points, 1))], axis=1
+    )
     if not prior[:, :k].any():
         return None
     mean = np.zeros(k) if plan_of(name).proportional else np.ones(k)
@@ -238,7 +239,7 @@ def _counting(own: Float[np.ndarray, "grid k k"]) -> Float[np.ndarray, "grid k"]
 
 
 def lone_frequencies(
-    settings: Sequence[Setting], left: Sequence[Float[np.ndarray, "lines outputs"]]
+    settings: Sequence[Setting], left: Sequence[Complex[np.ndarray, "_ _"]]
 ) -> Float[np.ndarray, " f"]:
     """Frequencies, Hz, about the lines that stand out most from those around them.
 
@@ -252,7 +253,9 @@ def lone_frequencies(
     for setting, lines in zip(settings, left, strict=True):
         power = ((np.abs(lines) * np.asarray(setting.scale)) ** 2).sum(axis=1)
         used = (np.asarray(setting.spectra.weight) == 1) * 1.0
-        beside = np.convolve(power * used, around, mode="same") / np.maximum(np.convolve(used, around, "same"), 1)
+        beside = np.convolve(power * used, around, mode="same") / np.maximum(
+            np.convolve(used, around, "same"), 1
+        )
         ratio = used * power / np.maximum(beside, np.finfo(float).tiny)
         hertz = np.asarray(setting.spectra.omega) / (2 * np.pi)
         for i in _peaks(ratio):
