@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxsid.gap.free_run import free_run
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import FIXED, SUBSTEPS, Bench, Refit
+from jaxsid.gap.refit import FIXED, Bench, Refit
 from jaxsid.gap.shooting import Prior, fitted, products
 from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -108,7 +108,7 @@ def left_of(
         y = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].y)) for i in own])
         seen = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].weight)) for i in own]) > 0
         if windowed:
-            rest = np.concatenate([_judged(blocks[i], _left(found, blocks[i], states[i])) for i in own])
+            rest = np.concatenate([_judged(blocks[i], _left(found, blocks[i], states[i], bench.substeps)) for i in own])
         else:
             rest = _run(found, bench, blocks[own[0]], states[own[0]][0], record, number, first) - y[: len(record.y) - first]
         count = len(record.y) - first
@@ -127,14 +127,14 @@ def _states(found: Refit, bench: Bench, blocks: Sequence[Block]) -> list[np.ndar
     same = np.full(len(theta), FIXED)
     prior = Prior(same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden]))
     nothing = [np.zeros((len(b.y), n)) for b in blocks]
-    fit = fitted(found.shot, blocks, prior, theta, nothing, substeps=SUBSTEPS, steps=ROUNDS)
+    fit = fitted(found.shot, blocks, prior, theta, nothing, substeps=bench.substeps, steps=ROUNDS)
     return list(fit.states)
 
 
-def _left(found: Refit, block: Block, states: np.ndarray) -> np.ndarray:
+def _left(found: Refit, block: Block, states: np.ndarray, substeps: int) -> np.ndarray:
     import jax.numpy as jnp
 
-    given = jnp.asarray(found.fit.theta), jnp.asarray(states), jnp.asarray(SUBSTEPS)
+    given = jnp.asarray(found.fit.theta), jnp.asarray(states), jnp.asarray(substeps)
     return np.asarray(products(found.shot, block, *given).left)
 
 
@@ -147,7 +147,7 @@ def _run(
 ) -> np.ndarray:
     u = np.asarray(ordered_inputs(bench.model, record)[0])
     begin = int(block.first[0])
-    given = {"record": number, "first": begin, "substeps": SUBSTEPS}
+    given = {"record": number, "first": begin, "substeps": bench.substeps}
     outputs = free_run(found.shot, found.fit.theta, u, block.ramps, float(record.dt), state, **given)
     return outputs[first - begin :]
 

@@ -19,7 +19,7 @@ from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 20.0
-TRIED, REFINED = 10, 4  # candidates fitted roughly, and of these thoroughly
+TRIED, FURTHER, REFINED = 10, 6, 4  # candidates fitted roughly at first, in further rounds; of these thoroughly
 ROUGH_STEPS, ROUGH_BLOCKS = 8, 1
 CLOSE = 60.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
@@ -118,7 +118,7 @@ def rank(
     part = bench.part(ROUGH_BLOCKS)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
     rough = []
-    for c in _distinct(candidates, base, errors)[:TRIED]:
+    for c in _distinct(candidates, base, errors)[: TRIED if before is None else FURTHER]:
         say(f"{c.kind} at {_label(c.place)}")
         hypothesis = extended(base, c, errors)
         start = _changes(before, bench, c.changes)

@@ -188,8 +188,10 @@ def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str)
     for j in range(outputs):
         if not np.isfinite(signals[:, :, j]).all():
             continue
-        taps[j] = whitening_filter(signals[:, :, j])
-        white = sum(c * np.roll(signals[:, :, j], k, axis=1) for k, c in enumerate(taps[j]))
+        # an offset is no noise: a filter that took it for some would hide it
+        own = signals[:, :, j] - signals[:, :, j].mean()
+        taps[j] = whitening_filter(own)
+        white = sum(c * np.roll(own, k, axis=1) for k, c in enumerate(taps[j]))
         level[j] = np.sqrt((np.asarray(white)[:, MOST:] ** 2).mean())
     return Noise(level, taps, float(signals[:, :, 0].size), source)
 

@@ -22,6 +22,7 @@ from jaxsid.gap.shooting import STEPS, Fit, Prior, Shot, fitted, parameters_of
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Effect, LumpedModel, second_order
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
@@ -31,7 +32,8 @@ FIXED = 1e-9  # deviation of what does not vary
 MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
 LEAST_ELEMENT = -0.95
-SUBSTEPS = 2
+STEPS_A_PERIOD = 20.0  # of the quickest vibration
+MOST_SUBSTEPS = 8
 
 
 class Bench(NamedTuple):
@@ -46,6 +48,7 @@ class Bench(NamedTuple):
         wide: (e,) likewise, of elements that are wrong.
         still: (2 N,) standard deviations of initial states, far above what they are.
         records: how many there are.
+        substeps: steps for each sampling interval.
     """
 
     model: LumpedModel
@@ -56,6 +59,7 @@ class Bench(NamedTuple):
     wide: Float[np.ndarray, " e"]
     still: Float[np.ndarray, " n"]
     records: int
+    substeps: int
 
     def part(self, blocks: int) -> "Bench":
         """The same with some blocks only, from all along the records.
@@ -138,7 +142,16 @@ def bench_of(
         far,
         LARGE * np.maximum(half, np.finfo(float).tiny),
         len(records),
+        _substeps(model, max(float(r.dt) for r in records)),
     )
+
+
+def _substeps(model: LumpedModel, dt: float) -> int:
+    """Enough for a law that acts as quickly as the model vibrates where it can be seen to."""
+    plain = physical_displacement_velocity(second_order(model))
+    rates = np.abs(np.linalg.eigvals(np.asarray(plain.A)).imag)
+    quickest = min(float(rates.max(initial=0.0)), np.pi / dt)
+    return int(np.clip(np.ceil(STEPS_A_PERIOD * quickest * dt / (2 * np.pi)), 1, MOST_SUBSTEPS))
 
 
 def _without_effects(model: LumpedModel) -> LumpedModel:
@@ -169,18 +182,28 @@ def refitted(
         states: of every block, hidden ones too, to begin with; else those of the best linear model.
         steps: most evaluations.
     """
-    model, effects = bench.model, hypothesis.effects
-    linear, slots = second_order(model), effect_slots(model, effects)
-    coordinates = coordinates_of(effects, amplitudes_of(linear, slots, bench.moved))
-    shot = Shot(linear, element_directions(model), slots, coordinates)
-    z = coordinates.unknowns(parameter_rows(effects))
+    effects = hypothesis.effects
+    shot = _shot(bench, effects)
+    slots = shot.slots
+    z = shot.coordinates.unknowns(parameter_rows(effects))
     prior = _prior(bench, hypothesis, shot)
     start = np.zeros(len(bench.tolerance)) if changes is None else np.asarray(changes)
     theta = np.concatenate([start, z.ravel(), np.zeros((bench.records - 1) * len(z))])
     own = 2 * slots.count
     given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
-    fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=SUBSTEPS, steps=steps)
+    fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=bench.substeps, steps=steps)
     return _concluded(bench, hypothesis, shot, fit)
+
+
+def _shot(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
+    linear, slots = second_order(bench.model), effect_slots(bench.model, effects)
+    coordinates = coordinates_of(effects, amplitudes_of(linear, slots, bench.moved))
+    return Shot(linear, element_directions(bench.model), slots, coordinates)
+
+
+def plain_shot(bench: Bench) -> Shot:
+    """The model without any effect, ready to be simulated."""
+    return _shot(bench, ())
 
 
 def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:

@@ -29,6 +29,7 @@ GAIN = 0.05  # of the cost: a helpful step that brings less ends it
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
+RIDGE = 1e-13  # of a matrix with ones on its diagonal: less than its rounding matters
 
 
 class Shot(eqx.Module):
@@ -282,7 +283,8 @@ def _step(at: _At, prior: Prior, damping: float) -> tuple[np.ndarray, list[np.nd
 def _solved(matrix: Float[np.ndarray, "*w n n"], right: Float[np.ndarray, "*w n k"]) -> Float[np.ndarray, "*w n k"]:
     """Of positive matrices whose rows differ by orders of magnitude."""
     scale, scaled = _unit(matrix)
-    return np.linalg.solve(scaled, right / scale[..., :, None]) / scale[..., :, None]
+    whole = scaled + RIDGE * np.eye(scaled.shape[-1])
+    return np.linalg.solve(whole, right / scale[..., :, None]) / scale[..., :, None]
 
 
 def _unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -297,6 +299,9 @@ def _log_determinant(matrix: np.ndarray) -> np.ndarray:
 
 def _concluded(at: _At, blocks: Sequence[Block], prior: Prior, steps: int, settled: bool) -> Fit:
     own, mixed, inner = _normal(at, prior)
+    if not np.isfinite(at.cost):
+        nothing = np.full((len(own), len(own)), np.nan)
+        return Fit(at.theta, tuple(at.states), np.inf, 1, nothing, -np.inf, steps, False)
     reduced = own - np.einsum("wnp,wnq->pq", mixed, _solved(inner, mixed))
     determinant = float(_log_determinant(reduced) + _log_determinant(inner).sum())
     determinant += 2 * float(np.log(prior.deviation).sum() + len(inner) * np.log(prior.states).sum())

@@ -16,7 +16,7 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.simulate import measured_sensors, ordered_inputs
 from jaxsid.records import Record
 
-BLOCK = 8192  # samples that a block judges
+BLOCKS = 1024, 4096  # samples that a block judges: the shortest that a record fills, so that programs are few
 SHORTEST, LONGEST = 128, 2048  # samples that a window judges
 PERIODS = 4.0  # of the slowest vibration, in a window
 LEAD = 8  # part of a window, as its inverse, that comes before what it judges
@@ -90,7 +90,9 @@ def blocks_of(
 def _of_record(
     model: LumpedModel, record: Record, noise: Noise, number: int, length: int, begin: int
 ) -> list[Block]:
-    lead, count = length // LEAD, BLOCK // length
+    lead = length // LEAD
+    whole = next((b for b in BLOCKS if len(record.y) - begin <= b), BLOCKS[-1])
+    count = max(whole // length, 1)
     u, hold = ordered_inputs(model, record)
     ramps = jnp.asarray([h != "zero" for h in hold])
     rows, columns = measured_sensors(model, record)
