@@ -147,7 +147,7 @@ def diagnose(
     ] = Initial.estimate,
     quiet: Quiet = False,
 ) -> None:
-    """Where the model and the records part: is it noise, how large is it, and at which place does it arise."""
+    """Where the model and the records part, which effect causes it, and how far the gap shrinks with that effect."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
@@ -403,9 +403,9 @@ def _write_diagnosis(found, out: Path, say) -> None:
     with atomic_directory(out) as draft:
         write_json(draft / "diagnosis.json", found.as_dict())
         write_model(
-            found.examination.refit,
+            found.model,
             draft / "model.toml",
-            header="Numbers refitted by jaxsid to measured records.",
+            header="Numbers refitted and effects found by jaxsid in measured records.",
         )
         write_forces(found, draft / "forces.npz")
         write_diagnosis_report(found, draft / "report.html")

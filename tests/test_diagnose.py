@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from jaxsid import Effect, InputError, Record, diagnose, read_model, write_model
 from jaxsid.cli import app
 from jaxsid.files.results_json import plain
-from jaxsid.gap.diagnose import element_place
+from jaxsid.gap.explain import element_place
 from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
 from jaxsid.physical.elements import Element, element_matrices
 from jaxsid.report.diagnosis_page import diagnosis_page

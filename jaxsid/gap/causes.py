@@ -1,9 +1,10 @@
 """Why a model and records part: effects found one after another, how far the gap shrinks, and what is left."""
 
-import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,8 +18,9 @@ from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
+from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
 from jaxsid.gap.screen import Candidate, screen
+from jaxsid.gap.shooting import products
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
@@ -38,8 +40,10 @@ class Causes(NamedTuple):
         chosen: the best explanation.
         selected: what it adds to the nominal model, in the order in which it was found.
         nominal, recalibrated: the model as it is, and the best linear one, fitted the same way.
-        closure: on held-out samples.
+        closures: of every selected effect together with those before it, on held-out samples; of the model within
+            its tolerance where none was selected.
         left: what the chosen model leaves of these.
+        noises: of each record, from what the chosen model leaves where tests find nothing in it.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
     """
@@ -49,8 +53,9 @@ class Causes(NamedTuple):
     selected: tuple[Explanation, ...]
     nominal: Refit
     recalibrated: Refit
-    closure: Closure
+    closures: tuple[Closure, ...]
     left: Left
+    noises: tuple[Noise, ...]
     remaining: Null
     places: Scored | None
 
@@ -106,16 +111,60 @@ def causes_of(
         if look.clear or look.scored is None:
             break
     chosen = before if before is not None else rounds[0].without
-    say("how far the gap shrinks")
-    nominal = rounds[0].without
     linear = refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))))
-    windowed = is_free_or_unstable(model)
-    as_is = refitted(bench._replace(tolerance=np.full_like(bench.tolerance, 1e-9)), Hypothesis())
-    lefts = [left_of(x, bench, whole, noises, windowed=windowed) for x in (as_is, linear, chosen)]
-    closure = closure_of(*lefts, noises, [s.name for s in model.sensors])
+    if found.finding == "parameters" and _beyond(linear, chosen, rounds[-1].scale):
+        chosen, selected = linear, []
+    say("how far the gap shrinks")
+    floor = _floor(noises, bench, chosen) if look.clear else noises
+    lefts = partial(left_of, bench=bench, records=whole, noises=noises, windowed=is_free_or_unstable(model))
+    frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
+    ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
+    steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
+    names = [s.name for s in model.sensors]
     return Causes(
-        tuple(rounds), chosen, tuple(selected), nominal, linear, closure, lefts[2], look.null, look.scored
+        tuple(rounds),
+        chosen,
+        tuple(selected),
+        rounds[0].without,
+        linear,
+        tuple(closure_of(*ends, x, floor, names) for x in steps),
+        steps[-1],
+        floor,
+        look.null,
+        look.scored,
     )
+
+
+def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
+    """Whether all of the model's numbers together explain more than the few that were singled out."""
+    return (linear.fit.evidence - chosen.fit.evidence) / scale / TEMPERATURE > WORTH
+
+
+def _floor(noises: Sequence[Noise], bench: Bench, chosen: Refit) -> tuple[Noise, ...]:
+    """Noise of the level that the chosen model leaves, where nothing else told of it."""
+    if all(n.degrees > 0 for n in noises):
+        return tuple(noises)
+    lefts = [
+        np.asarray(
+            products(
+                chosen.shot,
+                block,
+                jnp.asarray(chosen.fit.theta),
+                jnp.asarray(states),
+                jnp.asarray(bench.substeps),
+            ).left
+        )
+        for block, states in zip(bench.blocks, chosen.fit.states, strict=True)
+    ]
+    found = []
+    for number, noise in enumerate(noises):
+        own = [i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number]
+        power = sum((lefts[i] ** 2 * (np.asarray(bench.blocks[i].weight) > 0)).sum(axis=(0, 1)) for i in own)
+        count = sum((np.asarray(bench.blocks[i].weight) > 0).sum(axis=(0, 1)) for i in own)
+        ratio = np.sqrt(power / np.maximum(count, 1)) / noise.rms()
+        level = noise.level * np.where(np.isfinite(ratio) & (ratio > 0), ratio, 1.0)
+        found.append(noise if noise.degrees > 0 else eqx.tree_at(lambda n: n.level, noise, level))
+    return tuple(found)
 
 
 def _worth(ranking: Ranking) -> bool:
@@ -165,7 +214,9 @@ def _deflated(record: Record, number: int, bench: Bench, before: Refit) -> Recor
     given = {"record": number, "first": begin, "substeps": bench.substeps}
     size, elements = 2 * len(bench.model.bodies), len(bench.tolerance)
     plain = plain_shot(bench)
-    theta = np.zeros(elements + plain.coordinates.centre.size + (bench.records - 1) * len(plain.slots.parameters))
+    theta = np.zeros(
+        elements + plain.coordinates.centre.size + (bench.records - 1) * len(plain.slots.parameters)
+    )
     theta[:elements] = before.fit.theta[:elements]
     start = np.pad(state[:size], (0, 2 * plain.slots.count))
     common = u, block.ramps, float(record.dt)

@@ -108,9 +108,14 @@ def left_of(
         y = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].y)) for i in own])
         seen = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].weight)) for i in own]) > 0
         if windowed:
-            rest = np.concatenate([_judged(blocks[i], _left(found, blocks[i], states[i], bench.substeps)) for i in own])
+            rest = np.concatenate(
+                [_judged(blocks[i], _left(found, blocks[i], states[i], bench.substeps)) for i in own]
+            )
         else:
-            rest = _run(found, bench, blocks[own[0]], states[own[0]][0], record, number, first) - y[: len(record.y) - first]
+            rest = (
+                _run(found, bench, blocks[own[0]], states[own[0]][0], record, number, first)
+                - y[: len(record.y) - first]
+            )
         count = len(record.y) - first
         mask = np.where(seen[:count], 0.0, np.nan)
         left.append(rest[:count] + mask)
@@ -125,7 +130,9 @@ def _states(found: Refit, bench: Bench, blocks: Sequence[Block]) -> list[np.ndar
     size = len(bench.still) // 2
     hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], found.shot.slots.count)
     same = np.full(len(theta), FIXED)
-    prior = Prior(same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden]))
+    prior = Prior(
+        same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden])
+    )
     nothing = [np.zeros((len(b.y), n)) for b in blocks]
     fit = fitted(found.shot, blocks, prior, theta, nothing, substeps=bench.substeps, steps=ROUNDS)
     return list(fit.states)
@@ -153,7 +160,12 @@ def _run(
 
 
 def closure_of(
-    nominal: Left, recalibrated: Left, after: Left, noises: Sequence[Noise], names: Sequence[str], seed: int = 0
+    nominal: Left,
+    recalibrated: Left,
+    after: Left,
+    noises: Sequence[Noise],
+    names: Sequence[str],
+    seed: int = 0,
 ) -> Closure:
     """The closure and its interval, by drawing pieces of the held-out samples.
 
@@ -187,7 +199,13 @@ def closure_of(
     low, high = np.quantile(draws, [0.025, 0.975])
     each = relative(parts[2], every)
     return Closure(
-        b, r, a, n, fraction(b, a, n), (float(low), float(high)), fraction(r, a, n),
+        b,
+        r,
+        a,
+        n,
+        fraction(b, a, n),
+        (float(low), float(high)),
+        fraction(r, a, n),
         dict(zip(names, each.tolist(), strict=True)),
     )
 

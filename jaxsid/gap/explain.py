@@ -19,8 +19,13 @@ from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 20.0
-TRIED, FURTHER, REFINED = 10, 6, 4  # candidates fitted roughly at first, in further rounds; of these thoroughly
+TRIED, FURTHER, REFINED = (
+    10,
+    6,
+    4,
+)  # candidates fitted roughly at first, in further rounds; of these thoroughly
 ROUGH_STEPS, ROUGH_BLOCKS = 8, 1
+SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 CLOSE = 60.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
@@ -60,6 +65,16 @@ class Ranking(NamedTuple):
     ranked: tuple[Explanation, ...]
     without: Refit
     scale: float
+
+
+def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
+    """Whether records hardly tell two explanations apart.
+
+    Args:
+        x, y: explanations.
+        of: the ranking that they are in.
+    """
+    return abs(x.evidence - y.evidence) / of.scale / TEMPERATURE < SAME
 
 
 def key_of(kind: str, place: Mapping[str, Any]) -> Key:

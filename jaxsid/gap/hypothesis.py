@@ -56,7 +56,9 @@ class Coordinates(eqx.Module):
         """
         logarithm = jnp.log(jnp.where(self.logarithmic, self.spread, 1.0)) * z
         ratio = jnp.where(
-            self.logarithmic, self.centre * jnp.exp(jnp.clip(logarithm, -50, 50)), self.centre + self.spread * z
+            self.logarithmic,
+            self.centre * jnp.exp(jnp.clip(logarithm, -50, 50)),
+            self.centre + self.spread * z,
         )
         power = jnp.take_along_axis(ratio, jnp.maximum(self.raised, 0), axis=1)
         power = jnp.where(self.raised >= 0, power, 1.0)
@@ -71,10 +73,14 @@ class Coordinates(eqx.Module):
         given, raised = np.asarray(parameters, float), np.asarray(self.raised)
         plain = given / np.asarray(self.scale)
         power = np.take_along_axis(plain, np.maximum(raised, 0), axis=1)
-        ratio = np.where(raised >= 0, given / np.asarray(self.scale) ** np.where(raised >= 0, power, 1.0), plain)
+        ratio = np.where(
+            raised >= 0, given / np.asarray(self.scale) ** np.where(raised >= 0, power, 1.0), plain
+        )
         centre, spread, size = (np.asarray(x) for x in (self.centre, self.spread, self.logarithmic))
         positive = np.where(size & (ratio > 0), ratio, centre)
-        log = np.log(np.where(size, positive / np.where(size, centre, 1.0), 1.0)) / np.where(size, np.log(spread), 1.0)
+        log = np.log(np.where(size, positive / np.where(size, centre, 1.0), 1.0)) / np.where(
+            size, np.log(spread), 1.0
+        )
         return np.where(size, log, (np.maximum(ratio, np.asarray(self.lowest)) - centre) / spread)
 
     def least(self) -> Float[np.ndarray, "slots most"]:
@@ -107,7 +113,9 @@ def effect_slots(model: LumpedModel, effects: Sequence[Effect]) -> Slots:
         model: names bodies, sensors and inputs.
         effects: of the hypothesis.
     """
-    slots = slots_of(eqx.tree_at(lambda m: m.effects, model, tuple(effects), is_leaf=lambda x: x is model.effects))
+    slots = slots_of(
+        eqx.tree_at(lambda m: m.effects, model, tuple(effects), is_leaf=lambda x: x is model.effects)
+    )
     if not effects:
         one = lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype)  # noqa: E731
         slots = Slots(jnp.asarray([kind_number(INERT)], jnp.int32), *map(one, _arrays(slots)))
@@ -126,11 +134,15 @@ def amplitudes_of(linear: SecondOrderModel, slots: Slots, moved: Sequence[Moved]
         slots: the places.
         moved: each record.
     """
-    each = [
-        amplitudes(linear, slots, *(jnp.asarray(x) for x in (m.displacements, m.velocities, m.u, m.y)), m.dt)
-        for m in moved
-    ]
-    return Amplitudes(*(np.sqrt(np.mean([np.asarray(x) ** 2 for x in field], axis=0)) for field in zip(*each, strict=True)))
+    each = []
+    for m in moved:
+        parts = (jnp.asarray(x) for x in (m.displacements, m.velocities, m.u, m.y))
+        q, v, u, y = parts
+        each.append(amplitudes(linear, slots, q, v, u, y, m.dt))
+    mean = (
+        np.sqrt(np.mean([np.asarray(x) ** 2 for x in field], axis=0)) for field in zip(*each, strict=True)
+    )
+    return Amplitudes(*mean)
 
 
 def coordinates_of(effects: Sequence[Effect], at: Amplitudes) -> Coordinates:

@@ -69,7 +69,9 @@ def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]
         InputError: an input or all sensors of a record are missing.
     """
     require(len(records) > 0, "give at least one record.")
-    return tuple(_at_least(_of_record(model, r, [x for x in records if x is not r]), model, r) for r in records)
+    return tuple(
+        _at_least(_of_record(model, r, [x for x in records if x is not r]), model, r) for r in records
+    )
 
 
 def _at_least(noise: Noise, model: LumpedModel, record: Record) -> Noise:

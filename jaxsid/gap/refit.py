@@ -67,7 +67,9 @@ class Bench(NamedTuple):
         Args:
             blocks: how many.
         """
-        chosen = np.unique(np.linspace(0, len(self.blocks) - 1, min(blocks, len(self.blocks))).round().astype(int))
+        chosen = np.unique(
+            np.linspace(0, len(self.blocks) - 1, min(blocks, len(self.blocks))).round().astype(int)
+        )
         return self._replace(
             blocks=tuple(self.blocks[i] for i in chosen), states=tuple(self.states[i] for i in chosen)
         )
@@ -118,7 +120,10 @@ def bench_of(
     dt = min(float(r.dt) for r in records)
     length = window_length(slowest_rate(model), dt, max(len(r.y) for r in records))
     blocks = blocks_of(model, records, noises, length)
-    motions = [np.asarray(in_time(s.spectra, x.motion.states)) for s, x in zip(refit.settings, refit.linear, strict=True)]
+    motions = [
+        np.asarray(in_time(s.spectra, x.motion.states))
+        for s, x in zip(refit.settings, refit.linear, strict=True)
+    ]
     size = len(model.bodies)
     moved = []
     for record, motion, setting in zip(records, motions, refit.settings, strict=True):
@@ -129,7 +134,8 @@ def bench_of(
     listed = element_matrices(model).listed
     nominal = np.asarray(element_matrices(model).nominal)
     near, far = (
-        np.where(nominal != 0, [of[x.quantity] for x in listed], FIXED) for of in (model.tolerance._asdict(), WIDE)
+        np.where(nominal != 0, [of[x.quantity] for x in listed], FIXED)
+        for of in (model.tolerance._asdict(), WIDE)
     )
     still = np.sqrt(np.mean([(m**2).mean(axis=0) for m in motions], axis=0))
     half = np.repeat([still[:size].max(), still[size:].max()], size)
@@ -191,7 +197,9 @@ def refitted(
     theta = np.concatenate([start, z.ravel(), np.zeros((bench.records - 1) * len(z))])
     own = 2 * slots.count
     given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
-    fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=bench.substeps, steps=steps)
+    fit = fitted(
+        shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=bench.substeps, steps=steps
+    )
     return _concluded(bench, hypothesis, shot, fit)
 
 
@@ -214,7 +222,11 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     shifts = np.tile(np.where(each, np.pi, FIXED), bench.records - 1)
     deviation = np.concatenate([elements, own, shifts])
     least = np.concatenate(
-        [np.full(len(elements), LEAST_ELEMENT), shot.coordinates.least().ravel(), np.full(len(shifts), -np.inf)]
+        [
+            np.full(len(elements), LEAST_ELEMENT),
+            shot.coordinates.least().ravel(),
+            np.full(len(shifts), -np.inf),
+        ]
     )
     most = np.where(np.arange(len(deviation)) < len(elements), MOST_ELEMENT, MOST_UNKNOWN)
     size = len(bench.still) // 2

@@ -214,7 +214,9 @@ def fitted(
     while done < steps:
         move, moves = _step(at, prior, damping)
         new = np.maximum(at.theta + move, prior.least)
-        found = _evaluated(shot, blocks, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps)
+        found = _evaluated(
+            shot, blocks, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
+        )
         done += 1
         gain = at.cost - found.cost
         if gain > 0:
@@ -241,7 +243,12 @@ class _At(NamedTuple):
 
 
 def _evaluated(
-    shot: Shot, blocks: Sequence[Block], prior: Prior, theta: np.ndarray, states: list[np.ndarray], substeps: int
+    shot: Shot,
+    blocks: Sequence[Block],
+    prior: Prior,
+    theta: np.ndarray,
+    states: list[np.ndarray],
+    substeps: int,
 ) -> _At:
     number = jnp.asarray(substeps)
     parts = [
@@ -250,9 +257,13 @@ def _evaluated(
     ]
     gram = np.concatenate(parts)
     squares = float(gram[:, -1, -1].sum())
-    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + ((np.concatenate(states) / prior.states) ** 2).sum()
+    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (
+        (np.concatenate(states) / prior.states) ** 2
+    ).sum()
     cost = 0.5 * (squares + float(own))
-    return _At(theta, states, cost if np.isfinite(gram).all() and np.isfinite(cost) else np.inf, squares, gram)
+    return _At(
+        theta, states, cost if np.isfinite(gram).all() and np.isfinite(cost) else np.inf, squares, gram
+    )
 
 
 def _normal(at: _At, prior: Prior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -280,7 +291,9 @@ def _step(at: _At, prior: Prior, damping: float) -> tuple[np.ndarray, list[np.nd
     return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
 
 
-def _solved(matrix: Float[np.ndarray, "*w n n"], right: Float[np.ndarray, "*w n k"]) -> Float[np.ndarray, "*w n k"]:
+def _solved(
+    matrix: Float[np.ndarray, "*w n n"], right: Float[np.ndarray, "*w n k"]
+) -> Float[np.ndarray, "*w n k"]:
     """Of positive matrices whose rows differ by orders of magnitude."""
     scale, scaled = _unit(matrix)
     whole = scaled + RIDGE * np.eye(scaled.shape[-1])

@@ -5,8 +5,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 
-from jaxsid.gap.diagnose import APART, Diagnosis
+from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.locate import Locations
+from jaxsid.gap.words import APART
 from jaxsid.report.diagnosis_page import share_of
 from jaxsid.report.numbers import change, misfit, percent, significant, with_std
 from jaxsid.report.plots.places import label_of

@@ -1,6 +1,7 @@
 """The page about an identification: findings first, then the evidence."""
 
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import units_of
 from jaxsid.report.evidence import (
     cbsi_section,
     frequency_section,
@@ -18,7 +19,6 @@ from jaxsid.report.frame import Gallery, Section, page
 from jaxsid.report.numbers import plural, significant
 from jaxsid.report.parameters import parameters_section
 from jaxsid.report.residuals import residual_section
-from jaxsid.report.units import units_of
 
 
 def report_page(found: Identification) -> str:

@@ -11,11 +11,11 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.gap.locate import Locations
 from jaxsid.gap.places import Place
+from jaxsid.mechanics.units import Units, units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.numbers import DASH
 from jaxsid.report.plots.time import close_look
 from jaxsid.report.style import BLUE, FONT, INK, MUTED, ORANGE, label, new_figure, scaled, shortened, title
-from jaxsid.report.units import Units, units_of
 
 SHOWN = 10  # places
 LINE = 0.2  # inches of height for one
