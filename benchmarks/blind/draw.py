@@ -223,7 +223,6 @@ def _sized(setup: _Setup, drawn: Drawn, noise: float, target: float, seed: list[
     """The size whose gap is nearest to the target, on a short record; None where it cannot be seen."""
     low, high = np.log(LIMITS.get(drawn.kind, ANY))
     size, best = 0.5 * (low + high), None
-    low_known = high_known = False
     for _ in range(TRIES):
         given = parameters(drawn.kind, float(np.exp(size)), scale, drawn.shape)
         effect = Effect(drawn.kind, drawn.where, drawn.ends, given)
@@ -237,7 +236,6 @@ def _sized(setup: _Setup, drawn: Drawn, noise: float, target: float, seed: list[
         if best is not None and _miss(best.severity, drawn, target) < 0.15:
             break
         low, high = (low, size) if much else (size, high)
-        low_known, high_known = low_known or not much, high_known or much
         size = 0.5 * (low + high)
     if best is None or best.severity.change < 0.5 * CHANGES[0] or _own(best.severity, drawn.kind) < 0.2:
         return None
@@ -253,9 +251,13 @@ def _miss(found: Severity, drawn: Drawn, target: float) -> float:
 
 def _judged(setup: _Setup, run: _Run, noise: float) -> Severity | None:
     y = run.y
-    if not np.all(np.isfinite(y)) or np.abs(y).max() > 1e100:
-        return None
+    if not _bounded(y) or np.any(y[run.before :].std(axis=0) <= 1e-9 * np.abs(y).max(axis=0)):
+        return None  # runs away, or sticks for good
     return severity(setup.true, run.u, y, _noise(run, noise), run.before)
+
+
+def _bounded(y: np.ndarray) -> bool:
+    return bool(np.all(np.isfinite(y)) and np.abs(y).max() < 1e100)
 
 
 def _resolved(setup: _Setup, effects: tuple[Effect, ...], steps: int, noise: float, seed: list[int]) -> tuple[int, float]:
@@ -374,7 +376,7 @@ def _made(
         fed_back = float(_noise(first, case.noise)[setup.loop.sensor])
     for i, n in enumerate(samples):
         runs.append(_record(setup, own[i], [*seed, 3 + i], n, level * setup.ratio**i, steps, fed_back))
-    if not all(np.all(np.isfinite(r.y)) and np.abs(r.y).max() < 1e100 for r in runs):
+    if not all(_bounded(r.y) for r in runs):
         return None
     std = _noise(runs[0], case.noise)
     severities = tuple(severity(setup.true, r.u, r.y, std, r.before) for r in runs)

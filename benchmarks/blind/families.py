@@ -90,16 +90,17 @@ def drive(rng: np.random.Generator) -> Nominal:
 
 
 def tree(rng: np.random.Generator) -> Nominal:
-    """Two to eight bodies, each joined to an earlier one or the ground, some with one connection more."""
+    """Two to eight bodies, each joined to an earlier one, some with one or two connections more."""
     names = _named(int(rng.integers(2, 9)), "b")
     pairs = [(GROUND, names[0])]
     for i, body in enumerate(names[1:], start=1):
-        earlier = GROUND if rng.random() < 0.1 else names[int(rng.integers(i))]
-        pairs.append((earlier, body))
+        pairs.append((names[int(rng.integers(i))], body))
     if len(names) > 2 and rng.random() < 0.3:
         a, b = sorted(rng.choice(len(names), 2, replace=False))
         if (names[a], names[b]) not in pairs:
             pairs.append((names[a], names[b]))
+    if rng.random() < 0.3:
+        pairs.append((GROUND, names[-1]))
     system = _built(rng, "tree", names, pairs, _log(rng, 1e-5, 1e4), _log(rng, 0.3, 200))
     return _sampled(rng, system, str(rng.choice(names)), "force")
 
