@@ -307,7 +307,8 @@ def _effects(rng: np.random.Generator, case: Planned, setup: _Setup, seed: list[
     found: list[Sized] = []
     for kind in case.kinds:
         place = place_of(rng, kind, setup.nominal)
-        low = max(GAPS[0], CHANGES[0] / case.noise)
+        # a refit takes up most of what a law does: less of the response has to be left than it changed by
+        low = max(GAPS[0], CHANGES[0] / case.noise * (1.0 if kind in ABSORBED else 0.3))
         target = float(np.exp(rng.uniform(np.log(low), np.log(min(GAPS[1], CHANGES[1] / case.noise)))))
         drawn = shape(rng)
         if place is None:
