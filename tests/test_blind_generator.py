@@ -142,8 +142,9 @@ def test_effects_agree_with_integration_from_event_to_event(kind):
         at = ("between", ("ground", "b3"), (effects_truth.GROUND, 2))
     where, ends, place = at
     u = force(120)
+    M, damping, K = systems.matrices(CHAIN)
     sensors = ((0, "acceleration"), (1, "velocity"), (2, "displacement"))
-    chain = effects_truth.Chain(*systems.matrices(CHAIN), 0, sensors)
+    chain = effects_truth.Chain(M, damping, K, 0, sensors)
     reference = effects_truth.Truth(chain, kind, place, CASES[kind], DT).run(u)
     found = respond(CHAIN, (systems.Effect(kind, where, ends, CASES[kind]),), u).y
     plain = respond(CHAIN, (), u).y
@@ -257,7 +258,9 @@ def test_impacts_agree_with_radau_from_event_to_event():
         reference.append([x[0], x[1], rate(0.0, x, push)[1]])
         t = k * DT
         while (k + 1) * DT - t > 1e-12:
-            run = solve_ivp(rate, (t, (k + 1) * DT), x, "Radau", rtol=1e-9, atol=1e-13, args=(push,), events=reached)
+            run = solve_ivp(
+                rate, (t, (k + 1) * DT), x, "Radau", rtol=1e-9, atol=1e-13, args=(push,), events=reached
+            )
             t, x = run.t[-1], run.y[:, -1]
             if run.status == 1:
                 x, hits = np.array([gap, -restitution * x[1]]), hits + 1
@@ -373,10 +376,12 @@ def test_scores_of_a_few_answers():
     good = {"kind": "cubic_stiffness", "place": {"between": ["b2", "b1"]}, "probability": 0.9}
     wrong = {"kind": "backlash", "place": {"between": ["b1", "b2"]}, "probability": 0.8}
     found = lambda *effects: score.Scored(  # noqa: E731
-        label, {"verdict": "effect", "effects": list(effects), "closure": {"fraction": 0.9}}, 1.0, 1.0
+        label, {"verdict": "effect", "effects": list(effects), "closure": {"fraction": 0.9}}, 1.0
     )
-    none = score.Scored({"effects": [], "truth": "none", "one_sensor": False}, {"verdict": "effect"}, 1.0, 1.0)
-    failed = score.Scored(label, {}, 1.0, 1.0)
+    none = score.Scored(
+        {"effects": [], "truth": "none", "one_sensor": False}, {"verdict": "effect"}, 1.0, 1.0
+    )
+    failed = score.Scored(label, {}, 1.0)
     result = score.scored([found(good, wrong), found(wrong, good), none, failed])
     assert result["first"]["hits"] == 1
     assert result["first_two"]["hits"] == 2

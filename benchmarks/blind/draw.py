@@ -76,13 +76,15 @@ def place_of(rng: np.random.Generator, kind: str, system: System) -> tuple[str, 
     free = [(GROUND, b) for b in bodies if frozenset((GROUND, b)) not in joined]
     pick = lambda x: x[int(rng.integers(len(x)))] if x else None  # noqa: E731
     if kind in SENSOR:
-        return "sensor", (pick([s.name for s in system.sensors]),)
+        return "sensor", (str(rng.choice([s.name for s in system.sensors])),)
     if kind in INPUT:
         return "input", (system.inputs[0].name,)
     if kind in ("mass_error", "missing_mode", *FORCES, "random_force"):
-        return "body", (pick(bodies),)
+        return "body", (str(rng.choice(bodies)),)
     if kind == "missing_connection":
-        others = [(a, b) for i, a in enumerate(bodies) for b in bodies[i + 1 :] if frozenset((a, b)) not in joined]
+        others = [
+            (a, b) for i, a in enumerate(bodies) for b in bodies[i + 1 :] if frozenset((a, b)) not in joined
+        ]
         ends = pick(free + others)
     elif kind == "damping_error":
         ends = pick([c.between for c in system.connections])
@@ -157,7 +159,14 @@ def _record(
     other = signal_of("random", rng, len(u), setup.true.dt, setup.band)
     with np.errstate(all="ignore"):
         made = respond(
-            setup.true, effects, u, before=before, steps=steps, loop=setup.loop, noise=noise, disturbance=other
+            setup.true,
+            effects,
+            u,
+            before=before,
+            steps=steps,
+            loop=setup.loop,
+            noise=noise,
+            disturbance=other,
         )
     return _Run(made.u, made.y, before)
 
@@ -219,7 +228,9 @@ class Sized(NamedTuple):
     steps: int
 
 
-def _sized(setup: _Setup, drawn: Drawn, noise: float, target: float, seed: list[int], scale: Scale) -> Sized | None:
+def _sized(
+    setup: _Setup, drawn: Drawn, noise: float, target: float, seed: list[int], scale: Scale
+) -> Sized | None:
     """The size whose gap is nearest to the target, on a short record; None where it cannot be seen."""
     low, high = np.log(LIMITS.get(drawn.kind, ANY))
     size, best = 0.5 * (low + high), None
@@ -231,7 +242,9 @@ def _sized(setup: _Setup, drawn: Drawn, noise: float, target: float, seed: list[
         found = _judged(setup, run, noise)
         # beyond the target, or beyond what a response may change by
         much = found is None or _own(found, drawn.kind) > target or found.change > CHANGES[1]
-        if found is not None and (best is None or _miss(found, drawn, target) < _miss(best[1], drawn, target)):
+        if found is not None and (
+            best is None or _miss(found, drawn, target) < _miss(best[1], drawn, target)
+        ):
             best = Sized(effect, found, target, steps)
         if best is not None and _miss(best.severity, drawn, target) < 0.15:
             break
@@ -260,7 +273,9 @@ def _bounded(y: np.ndarray) -> bool:
     return bool(np.all(np.isfinite(y)) and np.abs(y).max() < 1e100)
 
 
-def _resolved(setup: _Setup, effects: tuple[Effect, ...], steps: int, noise: float, seed: list[int]) -> tuple[int, float]:
+def _resolved(
+    setup: _Setup, effects: tuple[Effect, ...], steps: int, noise: float, seed: list[int]
+) -> tuple[int, float]:
     """Steps whose halving changes the readings by little of the noise, and that change."""
     if steps == 1:
         return 1, 0.0
@@ -358,13 +373,20 @@ def _rated(effects: tuple[Effect, ...], setup: _Setup, samples: int) -> tuple[Ef
     """Slow changes by as much over the first record as they had over the short one."""
     ratio = SHORT / samples
     return tuple(
-        e._replace(parameters={"rate": e.parameters["rate"] * ratio}) if e.kind == "time_varying_stiffness" else e
+        e._replace(parameters={"rate": e.parameters["rate"] * ratio})
+        if e.kind == "time_varying_stiffness"
+        else e
         for e in effects
     )
 
 
 def _made(
-    case: Planned, setup: _Setup, effects: tuple[Effect, ...], steps: int, seed: list[int], samples: tuple[int, int]
+    case: Planned,
+    setup: _Setup,
+    effects: tuple[Effect, ...],
+    steps: int,
+    seed: list[int],
+    samples: tuple[int, int],
 ) -> _Made | None:
     """Both records, noise added; None if the motion grows without bound or becomes too unlike."""
     rng = np.random.default_rng([*seed, 2])
@@ -428,8 +450,6 @@ def _labelled(
         "attempt": attempt,
         "nominal": setup.nominal._asdict(),
         "true": setup.true._asdict(),
-        "heldout_floor": [
-            float(x) for x in made.std / made.noisy[1][:, 1:].std(axis=0)
-        ],
+        "heldout_floor": [float(x) for x in made.std / made.noisy[1][:, 1:].std(axis=0)],
     }
     return Case(setup.nominal, made.noisy, label)

@@ -2,12 +2,15 @@
 
 import numpy as np
 import scipy.signal
+from scipy.signal.windows import tukey
 
 KINDS = ("random", "multisine", "chirp", "stepped_sine", "closed_loop")
 RAMP = 0.05  # of a step of the stepped sine, in which its amplitude fades
 
 
-def drawn(kind: str, rng: np.random.Generator, samples: int, dt: float, band: tuple[float, float]) -> np.ndarray:
+def drawn(
+    kind: str, rng: np.random.Generator, samples: int, dt: float, band: tuple[float, float]
+) -> np.ndarray:
     """A signal of unit rms.
 
     Args:
@@ -27,7 +30,7 @@ def drawn(kind: str, rng: np.random.Generator, samples: int, dt: float, band: tu
         t = np.arange(samples) * dt
         ends = (low, high) if rng.random() < 0.7 else (high, low)
         way = "linear" if rng.random() < 0.5 else "logarithmic"
-        u = scipy.signal.chirp(t, ends[0], t[-1], ends[1], method=way, phi=float(rng.uniform(0, 360)))
+        u = scipy.signal.chirp(t, ends[0], t[-1], ends[1], method=way, phi=int(rng.integers(360)))
     else:
         u = _stepped(rng, samples, dt, low, high)
     return u / u.std()
@@ -50,6 +53,6 @@ def _stepped(rng: np.random.Generator, samples: int, dt: float, low: float, high
     frequencies = np.geomspace(low, high, count) * rng.uniform(0.97, 1.03, count)
     u = np.zeros(samples)
     for a, b, f in zip(edges, edges[1:], frequencies, strict=False):
-        fade = scipy.signal.windows.tukey(b - a, 2 * RAMP)
+        fade = tukey(b - a, 2 * RAMP)
         u[a:b] = fade * np.sin(2 * np.pi * f * np.arange(b - a) * dt)
     return u

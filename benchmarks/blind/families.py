@@ -51,7 +51,9 @@ def _sampled(rng: np.random.Generator, system: System, driven: str, name: str) -
     modes = frequencies(system) / (2 * np.pi)
     dt = float(f"{1 / (modes[-1] * rng.uniform(6, 16)):.3g}")
     system = system._replace(dt=dt, inputs=(Input(name, driven),))
-    return Nominal(system, (float(modes[0] * rng.uniform(0.2, 0.6)), float(modes[-1] * rng.uniform(1.05, 1.5))))
+    return Nominal(
+        system, (float(modes[0] * rng.uniform(0.2, 0.6)), float(modes[-1] * rng.uniform(1.05, 1.5)))
+    )
 
 
 def mass(rng: np.random.Generator) -> Nominal:
@@ -133,7 +135,9 @@ def sensors(rng: np.random.Generator, family: str, system: System, alone: bool) 
         n = len(system.bodies)
         count = min(n, 3) if family != "tree" else int(rng.integers(min(n, 2), n + 1))
         at = [system.bodies[i] for i in sorted(rng.choice(n, count, replace=False))]
-        same = "acceleration" if family == "frame" else str(rng.choice([*every, "acceleration", "acceleration"]))
+        same = (
+            "acceleration" if family == "frame" else str(rng.choice([*every, "acceleration", "acceleration"]))
+        )
         mixed = family != "frame" and rng.random() < 0.4
         kinds = [str(rng.choice(every)) if mixed else same for _ in at]
     found = tuple(Sensor(f"{k[:3]}_{b}", b, k) for b, k in zip(at, kinds, strict=False))

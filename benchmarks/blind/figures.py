@@ -1,6 +1,6 @@
 """The confusion matrix and the calibration plot of a scored set.
 
-    .venv/bin/python benchmarks/blind/figures.py OUT FOLDER
+.venv/bin/python benchmarks/blind/figures.py OUT FOLDER
 """
 
 import json
@@ -33,7 +33,9 @@ def confusion(table: dict[str, dict[str, int]], path: Path) -> None:
         for name, count in table[true].items():
             column = "elsewhere" if name.endswith(", elsewhere") else name
             shares[i, columns.index(column)] += count / sum(table[true].values())
-    figure, axes = plt.subplots(figsize=(0.28 * len(columns) + 3, 0.28 * len(rows) + 2.2), layout="constrained")
+    figure, axes = plt.subplots(
+        figsize=(0.28 * len(columns) + 3, 0.28 * len(rows) + 2.2), layout="constrained"
+    )
     axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
     for i, j in np.argwhere(shares > 0):
         axes.text(j, i, f"{100 * shares[i, j]:.0f}", ha="center", va="center", fontsize=6,

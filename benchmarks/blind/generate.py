@@ -49,7 +49,8 @@ def csv(system: System, record: np.ndarray) -> str:
     """
     names = ["time", system.inputs[0].name, *(s.name for s in system.sensors)]
     rows = (
-        ",".join([f"{k * system.dt:.12g}", *(f"{x:.9g}" for x in row)]) for k, row in enumerate(record.tolist())
+        ",".join([f"{k * system.dt:.12g}", *(f"{x:.9g}" for x in row)])
+        for k, row in enumerate(record.tolist())
     )
     return "\n".join([",".join(names), *rows]) + "\n"
 
@@ -83,7 +84,9 @@ def write_case(out: Path, number: int, case: Case) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--set", choices=sorted(SETS), required=True)
     parser.add_argument("--cases", type=int, required=True)

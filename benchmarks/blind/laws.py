@@ -67,9 +67,7 @@ class Iwan:
     def commit(self, d: float) -> None:
         """A step has ended at d."""
         moved, self.last = d - self.last, d
-        self.stretch = [
-            max(-x, min(x, z + moved)) for z, x in zip(self.stretch, self.limits, strict=True)
-        ]
+        self.stretch = [max(-x, min(x, z + moved)) for z, x in zip(self.stretch, self.limits, strict=True)]
 
 
 def iwan_limits(yielding: float, spread: float) -> tuple[float, ...]:
@@ -136,4 +134,6 @@ def friction_level(effect: Effect) -> Callable[[float], float]:
     p = effect.parameters
     if effect.kind == "coulomb_friction":
         return lambda speed: p["force"]
-    return lambda speed: p["force"] + (p["static_force"] - p["force"]) * math.exp(-((speed / p["velocity"]) ** 2))
+    return lambda speed: (
+        p["force"] + (p["static_force"] - p["force"]) * math.exp(-((speed / p["velocity"]) ** 2))
+    )

@@ -10,7 +10,10 @@ CYCLE = 240  # cases after which shares are as they should be
 NONE, PAIRS, UNKNOWN = 48, 48, 36  # of a cycle; the rest has one effect
 SETS = {"dev": 7_100_000, "test": 9_300_000}  # seeds, far apart
 NOISES = ((0.01, 0.6), (0.001, 0.2), (0.05, 0.2))
-FAMILIES = {"dev": ("mass", "chain", "drive", "frame", "tree", "tree", "tree"), "test": ("mass", "chain", "drive", "frame")}
+FAMILIES = {
+    "dev": ("mass", "chain", "drive", "frame", "tree", "tree", "tree"),
+    "test": ("mass", "chain", "drive", "frame"),
+}
 # of a cycle's cases, by family in the order above: a mass says little about places
 SHARES = {"dev": (0.1, 0.15, 0.1, 0.15, 0.2, 0.15, 0.15), "test": (0.15, 0.35, 0.2, 0.3)}
 ONE_SENSOR, COLOURED = 0.15, 0.2
@@ -47,7 +50,9 @@ def pairs(rng: np.random.Generator, count: int) -> list[tuple[str, str]]:
     """
     while True:
         slots = [k for _ in range(-(-2 * count // len(CATALOGUE))) for k in rng.permutation(CATALOGUE)]
-        found = [(str(a), str(b)) for a, b in zip(slots[0 : 2 * count : 2], slots[1 : 2 * count : 2], strict=True)]
+        found = [
+            (str(a), str(b)) for a, b in zip(slots[0 : 2 * count : 2], slots[1 : 2 * count : 2], strict=True)
+        ]
         signal = {*SENSOR, *INPUT}
         for i, (a, b) in enumerate(found):
             if a == b or {a, b} <= signal:

@@ -34,7 +34,7 @@ class Contact(NamedTuple):
 
 
 class Impact(NamedTuple):
-    """A rigid one-sided stop at d = gap: speed jumps to -restitution times itself along `column`, and place along `shift` in time."""
+    """A rigid one-sided stop at d = gap; a jump of its speed by 1 moves the state by `column`, then `shift` a second."""
 
     gap: float
     restitution: float
@@ -114,7 +114,9 @@ class _Builder:
         self.n = n = len(M)
         self.inverse = np.linalg.inv(M)
         self.size = 2 * n + sum(
-            {"hysteresis": 1, "lugre": 1, "sensor_lag": 1, "actuator_lag": 1, "periodic_disturbance": 2}.get(e.kind, 0)
+            {"hysteresis": 1, "lugre": 1, "sensor_lag": 1, "actuator_lag": 1, "periodic_disturbance": 2}.get(
+                e.kind, 0
+            )
             for e in effects
         )
         self.A, self.B = np.zeros((self.size, self.size)), np.zeros((self.size, HELD))

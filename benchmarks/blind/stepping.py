@@ -54,9 +54,7 @@ class Stepper:
         self.W = self.J @ self.rub_gain
         self.rub, self.last, self.fastest = np.zeros(self.c), np.zeros(self.c), 1e-300
         self.reversals = Reversals(plant) if self.c else None
-        self.memories = [
-            (i, x.law) for i, x in enumerate(plant.ports) if isinstance(x.law, Iwan)
-        ]
+        self.memories = [(i, x.law) for i, x in enumerate(plant.ports) if isinstance(x.law, Iwan)]
 
     def forces(self, t: float, q: list[float]) -> list[float]:
         """Of all laws at given displacements and velocities."""
@@ -106,7 +104,9 @@ class Stepper:
         f4 = np.array(self.forces(t + self.h, end.tolist()))
         return np.concatenate([f1, f2 + f3, f4])
 
-    def _rubbed(self, reversals: Reversals, t: float, x: np.ndarray, w: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def _rubbed(
+        self, reversals: Reversals, t: float, x: np.ndarray, w: np.ndarray, after: np.ndarray
+    ) -> np.ndarray:
         """The step's end with friction; contacts in turns until they agree."""
         speeds = self.J @ x
         self.fastest = max(self.fastest, float(np.abs(speeds).max()))
