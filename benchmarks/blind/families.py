@@ -95,6 +95,7 @@ def tree(rng: np.random.Generator) -> Nominal:
     """Two to eight bodies, each joined to an earlier one, some with one or two connections more."""
     names = _named(int(rng.integers(2, 9)), "b")
     pairs = [(GROUND, names[0])]
+    body = names[0]
     for i, body in enumerate(names[1:], start=1):
         pairs.append((names[int(rng.integers(i))], body))
     if len(names) > 2 and rng.random() < 0.3:
@@ -102,7 +103,7 @@ def tree(rng: np.random.Generator) -> Nominal:
         if (names[a], names[b]) not in pairs:
             pairs.append((names[a], names[b]))
     if rng.random() < 0.3:
-        pairs.append((GROUND, names[-1]))
+        pairs.append((GROUND, body))
     system = _built(rng, "tree", names, pairs, _log(rng, 1e-5, 1e4), _log(rng, 0.3, 200))
     return _sampled(rng, system, str(rng.choice(names)), "force")
 

@@ -107,7 +107,9 @@ def force_law(effect: Effect, spring: float) -> Law | None:
         "one_sided_damping": lambda t, d, v: one * v if v > 0 else 0.0,
         "displacement_damping": lambda t, d, v: one * d * abs(v),
         "self_excitation": lambda t, d, v: one * ((d / p["limit"]) ** 2 - 1) * v,
-        "switching_stiffness": lambda t, d, v: p["stiffness"] * d if t >= p["instant"] else 0.0,
+        "switching_stiffness": lambda t, d, v: (
+            p["stiffness"] * d * min(max((t - p["instant"]) / p["rise"], 0.0), 1.0)
+        ),
         "parametric_stiffness": lambda t, d, v: (
             p["stiffness"] * math.sin(2 * math.pi * p["frequency_hz"] * t + p["phase"]) * d
         ),

@@ -34,7 +34,7 @@ class Contact(NamedTuple):
 
 
 class Impact(NamedTuple):
-    """A rigid one-sided stop at d = gap; a jump of its speed by 1 moves the state by `column`, then `shift` a second."""
+    """A rigid one-sided stop at d = gap; a jump of its speed by 1 moves the state by `column`, then `shift` per s."""
 
     gap: float
     restitution: float

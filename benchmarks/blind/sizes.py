@@ -139,6 +139,7 @@ def parameters(kind: str, size: float, s: Scale, drawn: dict[str, float]) -> dic
         "switching_stiffness": lambda: {
             "stiffness": max(sign * size, -0.6) * s.force / s.d,
             "instant": s.length * (0.3 + 0.4 * a),
+            "rise": s.length / 1000,
         },
         "parametric_stiffness": lambda: {
             "stiffness": force / s.d,

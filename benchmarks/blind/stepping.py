@@ -127,11 +127,14 @@ class Stepper:
 
     def _struck(self, before: np.ndarray, after: np.ndarray, stop: Impact) -> np.ndarray:
         """After a collision within the step, the rest of the step being made with the speed after it."""
-        (d0, _), (d, v) = stop.rows @ before, stop.rows @ after
+        (d0, v0), (d, v) = stop.rows @ before, stop.rows @ after
         if d <= stop.gap or v <= 0:
             return after
-        left = min(max((d - stop.gap) / max(d - d0, 1e-300), 0.0), 1.0) * self.h
-        jump = -(1 + stop.restitution) * v
+        way, gain = stop.gap - d0, (v - v0) / self.h
+        root = np.sqrt(max(v0**2 + 2 * gain * way, 0.0))
+        taken = min(max(2 * way / max(v0 + root, 1e-300), 0.0), self.h)
+        left = self.h - taken
+        jump = -(1 + stop.restitution) * (v - gain * left)
         return after + jump * stop.column + left * jump * stop.shift
 
     def readings(self, t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:

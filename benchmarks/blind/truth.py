@@ -20,6 +20,8 @@ STEPS = {  # of a sample, at least, by the kind of effect
     "iwan": 12,
     "lugre": 48,
     "hertz_contact": 12,
+    **dict.fromkeys(("displacement_damping", "one_sided_damping", "fifth_order_stiffness"), 16),
+    "switching_stiffness": 12,
     "impacts": 40,
     "input_delay": 20,
     "sensor_delay": 20,
