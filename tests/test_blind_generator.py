@@ -265,7 +265,9 @@ def test_impacts_agree_with_radau_from_event_to_event():
             if run.status == 1:
                 x, hits = np.array([gap, -restitution * x[1]]), hits + 1
     assert hits > 2
-    assert off(found[:, :1], np.array(reference)[:, :1]) < 1e-3  # a speed may be read on either side of a jump
+    assert (
+        off(found[:, :1], np.array(reference)[:, :1]) < 1e-3
+    )  # a speed may be read on either side of a jump
 
 
 def test_a_loop_feeds_back_what_is_measured():

@@ -79,10 +79,15 @@ def among(case: Scored, number: int, first: int) -> bool:
 
 
 def both(case: Scored) -> bool:
-    """Whether the selected effects are the two true ones and no other."""
+    """Whether the two true effects are among those selected."""
     said = {answer(e["kind"], e["place"]) for e in case.found.get("selected") or []}
     hits = [said & right_answers(case.label, i) for i in range(2)]
     return all(hits) and len(set.union(*hits)) >= 2
+
+
+def both_alone(case: Scored) -> bool:
+    """Whether the selected effects are the two true ones and no other."""
+    return both(case) and len(case.found.get("selected") or []) == 2
 
 
 def first_is_right(case: Scored) -> bool:
@@ -232,6 +237,7 @@ def scored(rows: list[Scored]) -> dict[str, Any]:
         "false_unknown": share(single + double, lambda c: c.verdict == "unknown"),
         "missed": share(single + double, lambda c: c.verdict == "none"),
         "both_found": share(double, both),
+        "both_alone": share(double, both_alone),
         "calibration": calibration(rows),
         "closure": closures(single + double),
         "seconds": {
@@ -255,6 +261,7 @@ ROWS = (
     ("known effects called unknown", "false_unknown", "at most 3 %"),
     ("known effects called none", "missed", ""),
     ("two effects, both found", "both_found", "75 %"),
+    ("two effects, both found and nothing else", "both_alone", ""),
 )
 
 
