@@ -380,9 +380,7 @@ def test_scores_of_a_few_answers():
     found = lambda *effects: score.Scored(  # noqa: E731
         label, {"verdict": "effect", "effects": list(effects), "closure": {"fraction": 0.9}}, 1.0
     )
-    none = score.Scored(
-        {"effects": [], "truth": "none", "one_sensor": False}, {"verdict": "effect"}, 1.0, 1.0
-    )
+    none = score.Scored({"effects": [], "truth": "none", "one_sensor": False}, {"verdict": "effect"}, 1.0)
     failed = score.Scored(label, {}, 1.0)
     result = score.scored([found(good, wrong), found(wrong, good), none, failed])
     assert result["first"]["hits"] == 1

@@ -422,6 +422,7 @@ def _labelled(
 ) -> Case:
     n = len(setup.nominal.sensors)
     alone = [_own(s.severity, s.effect.kind) for s in sized]
+    whole = alone if len(sized) != 1 else [_own(made.severities[0], sized[0].effect.kind)]
     label: dict[str, Any] = {
         "case": case.number,
         "truth": "none" if not sized else "unknown" if case.kinds[0] in OUTSIDE else "effect",
@@ -431,6 +432,7 @@ def _labelled(
                 "kinds_right": list(UNLIKE.get(e.kind, () if e.kind in OUTSIDE else (e.kind,))),
                 "place": e.place,
                 "parameters": [x[i].parameters for x in made.effects],
+                "gap": whole[i],  # of the first record where the effect is alone in it
                 "gap_alone": alone[i],
                 "target": sized[i].target,
             }

@@ -44,7 +44,7 @@ class Scored(NamedTuple):
     @property
     def counts(self) -> bool:
         """Whether the effects are large enough to be asked for."""
-        return all(e["gap_alone"] >= LEAST for e in self.label["effects"])
+        return all(e.get("gap", e["gap_alone"]) >= LEAST for e in self.label["effects"])
 
     @property
     def ranked(self) -> list[dict[str, Any]]:
