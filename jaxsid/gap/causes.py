@@ -92,9 +92,8 @@ def causes_of(
     say = progress or (lambda text: None)
     noises = found.noises
     say("kinds of effects")
-    fit = recalibrated(model, seen, noises, wide=True, given=True)
-    bench = bench_of(model, seen, noises, fit)
-    look = _Look(fit, found.null, scored(model, seen, noises=noises))
+    bench = bench_of(model, seen, noises, found.fit)
+    look = _Look(found.fit, found.null, found.scored)
     rounds: list[Ranking] = []
     selected: list[Explanation] = []
     before: Refit | None = None
