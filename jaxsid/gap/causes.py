@@ -98,7 +98,7 @@ def causes_of(
     selected: list[Explanation] = []
     before: Refit | None = None
     while len(selected) < MOST_EFFECTS:
-        ranking = rank(bench, _candidates(model, before, look), before, say)
+        ranking = rank(bench, _candidates(look), before, say)
         rounds.append(ranking)
         if not ranking.ranked or (before is not None and not _worth(ranking)):
             break
@@ -175,16 +175,32 @@ def _worth(ranking: Ranking) -> bool:
     return gain > WORTH and less > max(LESS * above, LEAST * without.squares)
 
 
-def _candidates(model: LumpedModel, before: Refit | None, look: _Look) -> tuple[Candidate, ...]:
+def _candidates(look: _Look) -> tuple[Candidate, ...]:
+    """From the longest record, and those that hold sensors which it lacks: programs are compiled for each length."""
     if look.scored is None:
         return ()
-    of = look.scored
+    of, rows = (
+        look.scored,
+        _telling([np.asarray(s.spectra.present) for s in look.scored.settings], look.scored),
+    )
     motions = {
-        "force at the place": [x.motion for x in of.found.explained],
-        "refitted model": [x.motion for x in look.fit.linear],
+        "force at the place": [of.found.explained[i].motion for i in rows],
+        "refitted model": [look.fit.linear[i].motion for i in rows],
     }
-    left = [np.abs(np.asarray(x.left)) for x in look.fit.linear]
-    return screen(of.model, of.settings, of.places, motions, of.tolerance, left)
+    left = [np.abs(np.asarray(look.fit.linear[i].left)) for i in rows]
+    return screen(of.model, [of.settings[i] for i in rows], of.places, motions, of.tolerance, left)
+
+
+def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:
+    """Numbers of the longest records that together hold all sensors, and of those as long as one of them."""
+    lengths = [s.spectra.samples for s in of.settings]
+    order = sorted(range(len(lengths)), key=lambda i: -lengths[i])
+    chosen, seen = [], np.zeros_like(present[0])
+    for i in order:
+        if (present[i] > seen).any():
+            chosen.append(i)
+            seen = np.maximum(seen, present[i])
+    return [i for i in range(len(lengths)) if lengths[i] in {lengths[j] for j in chosen}]
 
 
 def _looked(

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.shooting import Shot, matrices_of, parameters_of
 from jaxsid.mechanics.augmented import augmented
 from jaxsid.mechanics.nonlinear import Response, forced, respond_to
@@ -52,7 +52,7 @@ def free_run(
     return np.concatenate(found)[: len(u) - first]
 
 
-@compiled
+@compiled_in_full
 def _piece(
     shot: Shot,
     theta: Array,

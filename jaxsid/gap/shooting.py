@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
 from jaxsid.mechanics.augmented import augmented
@@ -101,7 +101,7 @@ class Prior(NamedTuple):
     states: Float[np.ndarray, " n"]
 
 
-@compiled
+@compiled_in_full
 def products(shot: Shot, block: Block, theta: Array, states: Array, substeps: Array) -> Products:
     """What a step needs of a block.
 
