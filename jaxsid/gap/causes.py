@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,7 +19,6 @@ from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
 from jaxsid.gap.screen import Candidate, screen
-from jaxsid.gap.shooting import products
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
@@ -100,6 +98,7 @@ def causes_of(
     while len(selected) < MOST_EFFECTS:
         ranking = rank(bench, _candidates(look), before, say)
         rounds.append(ranking)
+        bench, noises = ranking.bench, ranking.bench.noises
         if not ranking.ranked or (before is not None and not _worth(ranking)):
             break
         best = ranking.ranked[0]
@@ -114,7 +113,8 @@ def causes_of(
     if found.finding == "parameters" and _beyond(linear, chosen, rounds[-1].scale):
         chosen, selected = linear, []
     say("how far the gap shrinks")
-    floor = _floor(noises, bench, chosen) if look.clear else noises
+    # what is left is noise where tests find nothing in it; else it may be less
+    floor = noises if look.clear else found.noises
     lefts = partial(left_of, bench=bench, records=whole, noises=noises, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
@@ -137,33 +137,6 @@ def causes_of(
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
     """Whether all of the model's numbers together explain more than the few that were singled out."""
     return (linear.fit.evidence - chosen.fit.evidence) / scale / TEMPERATURE > WORTH
-
-
-def _floor(noises: Sequence[Noise], bench: Bench, chosen: Refit) -> tuple[Noise, ...]:
-    """Noise of the level that the chosen model leaves, where nothing else told of it."""
-    if all(n.degrees > 0 for n in noises):
-        return tuple(noises)
-    lefts = [
-        np.asarray(
-            products(
-                chosen.shot,
-                block,
-                jnp.asarray(chosen.fit.theta),
-                jnp.asarray(states),
-                jnp.asarray(bench.substeps),
-            ).left
-        )
-        for block, states in zip(bench.blocks, chosen.fit.states, strict=True)
-    ]
-    found = []
-    for number, noise in enumerate(noises):
-        own = [i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number]
-        power = sum((lefts[i] ** 2 * (np.asarray(bench.blocks[i].weight) > 0)).sum(axis=(0, 1)) for i in own)
-        count = sum((np.asarray(bench.blocks[i].weight) > 0).sum(axis=(0, 1)) for i in own)
-        ratio = np.sqrt(power / np.maximum(count, 1)) / noise.rms()
-        level = noise.level * np.where(np.isfinite(ratio) & (ratio > 0), ratio, 1.0)
-        found.append(noise if noise.degrees > 0 else eqx.tree_at(lambda n: n.level, noise, level))
-    return tuple(found)
 
 
 def _worth(ranking: Ranking) -> bool:

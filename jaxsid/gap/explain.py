@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, refitted
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, refitted, weighed_anew
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
@@ -60,11 +60,13 @@ class Ranking(NamedTuple):
         ranked: fitted ones.
         without: the model with what was found before, its numbers within their tolerance.
         scale: mean square in noise that the best one leaves.
+        bench: that they were fitted to, the noise that of the best one where nothing else tells of it.
     """
 
     ranked: tuple[Explanation, ...]
     without: Refit
     scale: float
+    bench: Bench
 
 
 def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
@@ -142,21 +144,31 @@ def rank(
     ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
     top = rough[0][1].fit.evidence if rough else 0.0
+    if rough and any(n.degrees <= 0 for n in bench.noises):
+        say("level and colour of the noise")
+        best = refitted(bench, rough[0][1].hypothesis, changes=_elements(rough[0][1], bench))
+        bench = weighed_anew(bench, best)
+        without = refitted(bench, base, changes=_elements(without, bench), states=without.fit.states)
+        ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
     found = []
     for i, (c, r) in enumerate(rough):
         near = (top - r.fit.evidence) / scale / TEMPERATURE < CLOSE
         if i < REFINED and near:
             say(f"{c.kind} at {_label(c.place)}, thoroughly")
-            r = refitted(bench, r.hypothesis, changes=r.fit.theta[: len(bench.tolerance)])
+            r = refitted(bench, r.hypothesis, changes=_elements(r, bench))
             found.append((c, r, r.fit.evidence))
         else:
             found.append((c, r, math.nan))
     best = max((e for _, _, e in found if not math.isnan(e)), default=0.0)
     every = [(c, r, best - ratio * (top - r.fit.evidence) if math.isnan(e) else e) for c, r, e in found]
-    return _ranked(every, without)
+    return _ranked(every, without, bench)
 
 
-def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit) -> Ranking:
+def _elements(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
+    return found.fit.theta[: len(bench.tolerance)]
+
+
+def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench) -> Ranking:
     every = sorted(every, key=lambda x: -x[2])
     first = every[0][1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
@@ -170,6 +182,7 @@ def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit) -> Rank
         ),
         without,
         scale,
+        bench,
     )
 
 

@@ -198,13 +198,13 @@ def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str)
     return Noise(level, taps, float(signals[:, :, 0].size), source)
 
 
-def residual_noise(signals: Float[np.ndarray, "samples outputs"]) -> Noise:
+def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> Noise:
     """Level and colour of what a model left, taken for noise as a whole.
 
     Args:
-        signals: what it left; NaN for absent sensors.
+        signals: what it left, in one piece or several of equal length; NaN for absent sensors.
     """
-    noise = _fitted(signals[None], SOURCES[3])
+    noise = _fitted(signals if signals.ndim == 3 else signals[None], SOURCES[3])
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 

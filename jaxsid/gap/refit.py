@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxsid.gap.hypothesis import (
     Moved,
@@ -15,10 +17,10 @@ from jaxsid.gap.hypothesis import (
     parameter_rows,
     with_parameters,
 )
-from jaxsid.gap.noise import Noise
+from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
-from jaxsid.gap.shooting import STEPS, Fit, Prior, Shot, fitted, parameters_of
+from jaxsid.gap.shooting import STEPS, Fit, Prior, Shot, fitted, parameters_of, products
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -49,6 +51,7 @@ class Bench(NamedTuple):
         still: (2 N,) standard deviations of initial states, far above what they are.
         records: how many there are.
         substeps: steps for each sampling interval.
+        noises: of each record, that the blocks are weighed by.
     """
 
     model: LumpedModel
@@ -60,6 +63,7 @@ class Bench(NamedTuple):
     still: Float[np.ndarray, " n"]
     records: int
     substeps: int
+    noises: tuple[Noise, ...]
 
     def part(self, blocks: int) -> "Bench":
         """The same with some blocks only, from all along the records.
@@ -149,6 +153,7 @@ def bench_of(
         LARGE * np.maximum(half, np.finfo(float).tiny),
         len(records),
         _substeps(model, max(float(r.dt) for r in records)),
+        tuple(noises),
     )
 
 
@@ -161,9 +166,49 @@ def _substeps(model: LumpedModel, dt: float) -> int:
 
 
 def _without_effects(model: LumpedModel) -> LumpedModel:
-    import equinox as eqx
-
     return eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda x: x is model.effects)
+
+
+def weighed_anew(bench: Bench, found: Refit) -> Bench:
+    """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
+
+    Args:
+        bench: records.
+        found: a fit to all of it.
+    """
+    lefts = [np.asarray(x) for x in left_in_windows(bench, found)]
+    noises, blocks = list(bench.noises), list(bench.blocks)
+    for number, noise in enumerate(bench.noises):
+        own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
+        seen = np.concatenate([np.asarray(blocks[i].weight)[:, blocks[i].lead :] > 0 for i in own])
+        left = np.concatenate([lefts[i][:, blocks[i].lead :] for i in own])
+        whole = np.all(seen.any(axis=2), -1)
+        if noise.degrees > 0 or whole.sum() == 0:
+            continue
+        noises[number] = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
+        level = noises[number].level
+        inverse = jnp.asarray(
+            np.where(np.isfinite(level) & (level > 0), 1 / np.where(level > 0, level, 1.0), 0.0)
+        )
+        for i in own:
+            b = blocks[i]
+            taps = jnp.broadcast_to(jnp.asarray(noises[number].taps), b.taps.shape)
+            blocks[i] = eqx.tree_at(lambda x: (x.weight, x.taps), b, ((b.weight > 0) * inverse, taps))
+    return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
+
+
+def left_in_windows(bench: Bench, found: Refit) -> list[Array]:
+    """What a fit leaves of every block, simulated less measured.
+
+    Args:
+        bench: that it was fitted to.
+        found: the fit.
+    """
+    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
+    return [
+        products(found.shot, block, theta, jnp.asarray(states), substeps).left
+        for block, states in zip(bench.blocks, found.fit.states, strict=True)
+    ]
 
 
 def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:
@@ -261,12 +306,8 @@ def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Re
 
 def _slopes(shot: Shot, theta: np.ndarray) -> np.ndarray:
     """(slots * most, p) of the first record's parameters."""
-    import jax
-
     return np.asarray(jax.jacfwd(lambda t: parameters_of(shot, t, 0).ravel())(jnp.asarray(theta)))
 
 
 def _with_effects(model: LumpedModel, effects: tuple[Effect, ...]) -> LumpedModel:
-    import equinox as eqx
-
     return eqx.tree_at(lambda m: m.effects, model, effects, is_leaf=lambda x: x is model.effects)
