@@ -115,7 +115,7 @@ def causes_of(
     say("how far the gap shrinks")
     # what is left is noise where tests find nothing in it; else it may be less
     floor = noises if look.clear else found.noises
-    lefts = partial(left_of, bench=bench, records=whole, noises=noises, windowed=is_free_or_unstable(model))
+    lefts = partial(left_of, bench=bench, records=whole, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
@@ -208,8 +208,8 @@ def _deflated(record: Record, number: int, bench: Bench, before: Refit) -> Recor
     theta[:elements] = before.fit.theta[:elements]
     start = np.pad(state[:size], (0, 2 * plain.slots.count))
     common = u, block.ramps, float(record.dt)
-    change = free_run(before.shot, before.fit.theta, *common, state, **given)
-    change = (change - free_run(plain, theta, *common, start, **given))[-begin:]
+    change = free_run(before.shot, before.fit.theta, *common, state, **given).outputs
+    change = (change - free_run(plain, theta, *common, start, **given).outputs)[-begin:]
     names = [s.name for s in bench.model.sensors]
     columns = [change[:, names.index(n)] if n in names else 0.0 * change[:, 0] for n in record.outputs]
     return Record(

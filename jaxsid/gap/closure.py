@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from jaxsid.gap.free_run import free_run
+from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import FIXED, Bench, Refit
 from jaxsid.gap.shooting import Prior, fitted, products
@@ -86,77 +87,81 @@ def seen_part(record: Record) -> Record:
     )
 
 
-def left_of(
-    found: Refit, bench: Bench, records: Sequence[Record], noises: Sequence[Noise], *, windowed: bool
-) -> Left:
-    """What a fitted model leaves of held-out samples, its initial state there found from their beginning.
+def left_of(found: Refit, bench: Bench, records: Sequence[Record], *, windowed: bool) -> Left:
+    """What a fitted model leaves of held-out samples, running on from the last state that was fitted before them.
 
     Args:
         found: model.
         bench: that it was fitted to.
         records: whole.
-        noises: of each.
-        windowed: whether every window begins anew, for models that drift away.
+        windowed: whether every window begins anew from the state that suits it, for models that drift away.
     """
     begin = [held_out_begin(r) for r in records]
-    length = bench.blocks[0].y.shape[1] - bench.blocks[0].lead
-    blocks = blocks_of(bench.model, records, noises, length, begin)
-    states = _states(found, bench, blocks)
+    blocks = blocks_of(bench.model, records, bench.noises, _length(bench), begin)
     left, measured = [], []
     for number, (record, first) in enumerate(zip(records, begin, strict=True)):
-        own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
-        y = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].y)) for i in own])
-        seen = np.concatenate([_judged(blocks[i], np.asarray(blocks[i].weight)) for i in own]) > 0
-        if windowed:
-            rest = np.concatenate(
-                [_judged(blocks[i], _left(found, blocks[i], states[i], bench.substeps)) for i in own]
-            )
-        else:
-            rest = (
-                _run(found, bench, blocks[own[0]], states[own[0]][0], record, number, first)
-                - y[: len(record.y) - first]
-            )
+        own = [b for b in blocks if int(b.record[0]) == number]
         count = len(record.y) - first
-        mask = np.where(seen[:count], 0.0, np.nan)
-        left.append(rest[:count] + mask)
-        measured.append(y[:count] + mask)
+        y = np.concatenate([_judged(b, b.y) for b in own])[:count]
+        seen = np.concatenate([_judged(b, b.weight) for b in own])[:count] > 0
+        run, start = _run_on(found, bench, record, number)
+        if windowed:
+            states = _states(found, bench, own, run.states, start)
+            rest = np.concatenate(
+                [_judged(b, x) for b, x in zip(own, _left(found, bench, own, states), strict=True)]
+            )
+            rest = rest[:count]
+        else:
+            rest = run.outputs[first - start :] - y
+        mask = np.where(seen, 0.0, np.nan)
+        left.append(rest + mask)
+        measured.append(y + mask)
     return Left(tuple(left), tuple(measured))
 
 
-def _states(found: Refit, bench: Bench, blocks: Sequence[Block]) -> list[np.ndarray]:
+def _length(bench: Bench) -> int:
+    return bench.blocks[0].y.shape[1] - bench.blocks[0].lead
+
+
+def _judged(block: Block, x: Array | np.ndarray) -> np.ndarray:
+    return np.asarray(x)[:, block.lead :].reshape(-1, x.shape[2])
+
+
+def _run_on(found: Refit, bench: Bench, record: Record, number: int) -> tuple[Run, int]:
+    """The motion from the last window that was fitted to the record's end, and the number of its first sample."""
+    i = max(i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number)
+    block = bench.blocks[i]
+    last = int(np.flatnonzero(np.any(np.asarray(block.weight) > 0, axis=(1, 2)))[-1])
+    u, first = np.asarray(ordered_inputs(bench.model, record)[0]), int(block.first[last])
+    given = {"record": number, "first": first, "substeps": bench.substeps}
+    state = found.fit.states[i][last]
+    return free_run(found.shot, found.fit.theta, u, block.ramps, float(record.dt), state, **given), first
+
+
+def _states(
+    found: Refit, bench: Bench, blocks: Sequence[Block], run: np.ndarray, start: int
+) -> tuple[np.ndarray, ...]:
     """Initial states of windows, all else as it is."""
     theta = found.fit.theta
-    n = found.fit.states[0].shape[1]
     size = len(bench.still) // 2
     hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], found.shot.slots.count)
     same = np.full(len(theta), FIXED)
     prior = Prior(
         same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden])
     )
-    nothing = [np.zeros((len(b.y), n)) for b in blocks]
-    fit = fitted(found.shot, blocks, prior, theta, nothing, substeps=bench.substeps, steps=ROUNDS)
-    return list(fit.states)
+    begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]
+    fit = fitted(found.shot, blocks, prior, theta, begin, substeps=bench.substeps, steps=ROUNDS)
+    return fit.states
 
 
-def _left(found: Refit, block: Block, states: np.ndarray, substeps: int) -> np.ndarray:
-    import jax.numpy as jnp
-
-    given = jnp.asarray(found.fit.theta), jnp.asarray(states), jnp.asarray(substeps)
-    return np.asarray(products(found.shot, block, *given).left)
-
-
-def _judged(block: Block, x: np.ndarray) -> np.ndarray:
-    return x[:, block.lead :].reshape(-1, x.shape[2])
-
-
-def _run(
-    found: Refit, bench: Bench, block: Block, state: np.ndarray, record: Record, number: int, first: int
-) -> np.ndarray:
-    u = np.asarray(ordered_inputs(bench.model, record)[0])
-    begin = int(block.first[0])
-    given = {"record": number, "first": begin, "substeps": bench.substeps}
-    outputs = free_run(found.shot, found.fit.theta, u, block.ramps, float(record.dt), state, **given)
-    return outputs[first - begin :]
+def _left(
+    found: Refit, bench: Bench, blocks: Sequence[Block], states: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
+    return [
+        np.asarray(products(found.shot, b, theta, jnp.asarray(s), substeps).left)
+        for b, s in zip(blocks, states, strict=True)
+    ]
 
 
 def closure_of(

@@ -1,5 +1,8 @@
 """A hypothesis run over a record from one state, piece by piece, so that programs do not depend on its length."""
 
+from typing import NamedTuple
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -10,6 +13,13 @@ from jaxsid.mechanics.augmented import augmented
 from jaxsid.mechanics.nonlinear import Response, forced, respond_to
 
 PIECE, LEAD = 2048, 256  # samples of a piece, and before it, which late sensors and inputs need
+
+
+class Run(NamedTuple):
+    """From its first sample on: readings (samples, outputs) and states (samples, n)."""
+
+    outputs: Float[np.ndarray, "samples outputs"]
+    states: Float[np.ndarray, "samples n"]
 
 
 def free_run(
@@ -23,8 +33,8 @@ def free_run(
     record: int,
     first: int,
     substeps: int,
-) -> Float[np.ndarray, "samples outputs"]:
-    """Readings from a sample on, one row for it and each after it.
+) -> Run:
+    """Readings from a sample on, one row for it and each after it, and the states.
 
     Args:
         shot: the hypothesis.
@@ -47,9 +57,11 @@ def free_run(
         cut = jnp.asarray(whole[before + at - LEAD : before + at + PIECE + LEAD])
         piece = _piece(shot, *given, cut, now, jnp.asarray(at), number)
         outputs, states = (np.asarray(x) for x in (piece.outputs, piece.states))
-        found.append(outputs[: PIECE + LEAD] if not found else outputs[LEAD : PIECE + LEAD])
+        part = slice(LEAD if found else 0, PIECE + LEAD)
+        found.append((outputs[part], states[part]))
         at, now = at + PIECE, jnp.asarray(states[PIECE])
-    return np.concatenate(found)[: len(u) - first]
+    rows = len(u) - first
+    return Run(*(np.concatenate(x)[:rows] for x in zip(*found, strict=True)))
 
 
 @compiled_in_full
@@ -64,8 +76,6 @@ def _piece(
     first: Array,
     substeps: Array,
 ) -> Response:
-    import equinox as eqx
-
     slots = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters_of(shot, theta, record))
     system = augmented(matrices_of(shot, theta), slots)
     late = forced(system, slots, u, ramps, dt)
