@@ -99,7 +99,7 @@ def causes_of(
         ranking = rank(bench, _candidates(look), before, say)
         rounds.append(ranking)
         bench, noises = ranking.bench, ranking.bench.noises
-        if not ranking.ranked or (before is not None and not _worth(ranking)):
+        if not ranking.ranked or not _worth(ranking):
             break
         best = ranking.ranked[0]
         selected.append(best)

@@ -11,6 +11,9 @@ from jaxsid.gap.explain import Explanation
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.75  # part of the best linear model's gap, on held-out samples, below which nothing explains it
+SLIGHT = (
+    0.3  # of what the best linear model leaves: a part that no candidate explains, and that is of no matter
+)
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 
 
@@ -39,6 +42,8 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if causes is None:
         some = 0.5 * math.exp(-doubt / 0.05)
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
+    if not causes.selected and _slight(found):
+        return Verdict("none", {"none": 0.5, "effect": 0.25, "unknown": 0.25}, ())
     unexplained = _unexplained(causes)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
@@ -48,9 +53,17 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     return Verdict("ambiguous" if open_ones else "effect", probability, likely)
 
 
+def _slight(found: Examination) -> bool:
+    """Whether what tests find is small beside the noise, so that no law could be told from it."""
+    left = np.array(list(found.recalibrated.nrmse.values()))
+    return found.null.share < SLIGHT * float(np.sqrt(np.nanmean(left**2)))
+
+
 def _unexplained(causes: Causes) -> float:
     """Probability that the law is not in the catalogue: by how much of the gap the best one leaves."""
     last = causes.closures[-1]
+    if not causes.selected and causes.chosen is not causes.recalibrated:
+        return 1.0
     gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
     return float(1 / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
 
