@@ -14,7 +14,7 @@ from jaxsid.gap.free_run import free_run
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.null import Null, null_test
+from jaxsid.gap.null import Null, left_share, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
@@ -24,7 +24,8 @@ from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
 
-MOST_EFFECTS = 3
+MOST_EFFECTS = 2
+SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 3.0  # tempered gain of evidence from which on a further effect is taken
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.02  # and of all that is left
@@ -67,7 +68,8 @@ class _Look(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        return self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE
+        small = max(NEGLIGIBLE, SLIGHT * left_share(self.fit))
+        return self.null.p_value >= SIGNIFICANT or self.null.share <= small
 
 
 def causes_of(

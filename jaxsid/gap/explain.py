@@ -135,7 +135,8 @@ def rank(
     part = bench.part(ROUGH_BLOCKS)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
     rough = []
-    for c in _distinct(candidates, base, errors)[: TRIED if before is None else FURTHER]:
+    effort = FIRST if before is None else FURTHER
+    for c in _distinct(candidates, base, errors)[: effort.tried]:
         say(f"{c.kind} at {_label(c.place)}")
         hypothesis = extended(base, c, errors)
         start = _changes(before, bench, c.changes)
@@ -146,16 +147,18 @@ def rank(
     top = rough[0][1].fit.evidence if rough else 0.0
     if rough and any(n.degrees <= 0 for n in bench.noises):
         say("level and colour of the noise")
-        best = refitted(bench, rough[0][1].hypothesis, changes=_elements(rough[0][1], bench))
+        best = refitted(
+            bench, rough[0][1].hypothesis, changes=_elements(rough[0][1], bench), steps=effort.steps
+        )
         bench = weighed_anew(bench, best)
         without = refitted(bench, base, changes=_elements(without, bench), states=without.fit.states)
         ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
     found = []
     for i, (c, r) in enumerate(rough):
         near = (top - r.fit.evidence) / scale / TEMPERATURE < CLOSE
-        if i < REFINED and near:
+        if i < effort.refined and near:
             say(f"{c.kind} at {_label(c.place)}, thoroughly")
-            r = refitted(bench, r.hypothesis, changes=_elements(r, bench))
+            r = refitted(bench, r.hypothesis, changes=_elements(r, bench), steps=effort.steps)
             found.append((c, r, r.fit.evidence))
         else:
             found.append((c, r, math.nan))

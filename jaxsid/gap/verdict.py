@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsid.gap.causes import Causes
+from jaxsid.gap.causes import SLIGHT, Causes
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import Explanation
+from jaxsid.gap.null import left_share
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.75  # part of the best linear model's gap, on held-out samples, below which nothing explains it
@@ -55,8 +56,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
 
 def _slight(found: Examination) -> bool:
     """Whether what tests find is small beside the noise, so that no law could be told from it."""
-    left = np.array(list(found.recalibrated.nrmse.values()))
-    return found.null.share < SLIGHT * float(np.sqrt(np.nanmean(left**2)))
+    return found.null.share < SLIGHT * left_share(found.fit)
 
 
 def _unexplained(causes: Causes) -> float:
