@@ -19,16 +19,22 @@ from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 20.0
-TRIED, FURTHER, REFINED = (
-    10,
-    6,
-    4,
-)  # candidates fitted roughly at first, in further rounds; of these thoroughly
 ROUGH_STEPS, ROUGH_BLOCKS = 8, 1
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 CLOSE = 60.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
+
+
+class Effort(NamedTuple):
+    """How many candidates are fitted roughly, how many thoroughly, and in how many steps at most."""
+
+    tried: int
+    refined: int
+    steps: int
+
+
+FIRST, FURTHER = Effort(10, 4, 25), Effort(5, 2, 10)  # with two effects a step costs several times as much
 
 
 class Explanation(NamedTuple):

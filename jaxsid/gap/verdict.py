@@ -12,9 +12,6 @@ from jaxsid.gap.null import left_share
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.75  # part of the best linear model's gap, on held-out samples, below which nothing explains it
-SLIGHT = (
-    0.3  # of what the best linear model leaves: a part that no candidate explains, and that is of no matter
-)
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 
 
