@@ -65,7 +65,8 @@ class Diagnosis(NamedTuple):
     @property
     def model(self) -> LumpedModel:
         """The improved model: with the selected effects and refitted numbers."""
-        return self.examination.refit if self.causes is None else self.causes.chosen.model
+        nothing = self.causes is None or self.verdict == "none"
+        return self.examination.refit if nothing or self.causes is None else self.causes.chosen.model
 
     @property
     def closure(self) -> Closure | None:
@@ -151,10 +152,10 @@ class Diagnosis(NamedTuple):
 
     def selected(self) -> list[dict[str, Any]]:
         """The best explanation, one effect after another; empty where nothing was found."""
-        if self.causes is None:
+        if self.causes is None or self.verdict == "none":
             return []
         if not self.causes.selected:
-            return self._wrong_numbers()
+            return self._wrong_numbers() if self.verdict != "unknown" else []
         chosen = self.causes.chosen
         return [
             {**as_pair(x), "parameters": self._parameters(x, chosen), "gap_after": closure.by_sensor}

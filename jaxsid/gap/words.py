@@ -50,8 +50,13 @@ def summary(found: "Diagnosis") -> tuple[str, str]:
         found: the diagnosis.
     """
     causes = found.causes
-    if causes is None:
+    if causes is None or found.verdict == "none":
         told = "The records agree with the model, within its tolerance and the noise."
+        if causes is not None:
+            return (
+                told,
+                "Tests find a trace of something, too small beside the noise to be told or to matter.",
+            )
         if found.examination.before.total > APART:
             return told, "Its numbers are off by no more than they may be; refitted it leaves noise alone."
         return told, "Nothing that the model lacks is to be seen in these records."
@@ -98,7 +103,7 @@ def remaining(found: "Diagnosis") -> str:
         found: the diagnosis.
     """
     causes, gap = found.causes, found.examination.recalibrated
-    if causes is None:
+    if causes is None or found.verdict == "none":
         return f"The linear model, its numbers refitted, leaves {gap.total:.3g} times the noise."
     if causes.places is None:
         return "What remains: nothing significant."
@@ -129,7 +134,7 @@ def next_experiment(found: "Diagnosis") -> str:
         found: the diagnosis.
     """
     causes, places = found.causes, found.examination.locations
-    if causes is None:
+    if causes is None or found.verdict == "none":
         told = all(n.degrees > 0 for n in found.examination.noises)
         return "" if told else "A record with repeated periods, or a quiet start, would tell the noise apart."
     open_ones = [likely for likely in found.judgement.likely if len(likely) > 1]
