@@ -8,8 +8,7 @@ from rich.panel import Panel
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.locate import Locations
 from jaxsid.gap.words import APART
-from jaxsid.report.diagnosis_page import share_of
-from jaxsid.report.numbers import change, misfit, percent, significant, with_std
+from jaxsid.report.numbers import change, misfit, percent, share_of, significant, with_std
 from jaxsid.report.plots.places import label_of
 from jaxsid.report.summary import table
 
