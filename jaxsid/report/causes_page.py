@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsid.gap.closure import HELD_OUT, Left
+from jaxsid.gap.closure import HELD_OUT, Closure, Left
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import key_of
 from jaxsid.gap.words import kind_words, named, place_words
@@ -25,6 +25,8 @@ from jaxsid.report.plots.causes import before_after_figure, held_out_pairs, spec
 
 RANKED, TESTS, FIGURES = 6, 4, 3
 MOST_SENSORS = 6  # columns of a table
+SAME = 1.1  # ratio of two gaps that are about the same
+OPEN = "● "
 ORDINALS = ("First", "Second", "Third", "Fourth")
 
 
@@ -47,13 +49,11 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
     if found.causes is not None and found.causes.selected and name == "effect":
         chance_of = float(np.prod([x.probability for x in found.causes.selected]))
         remark = "of this explanation, of all that were tried"
-    low, high = closure.ci95
     after = "with the effect" if name == "effect" else "with the best of the catalogue"
     return (
         Card("Gap before", misfit(closure.before), "nominal model, held-out samples (NRMSE)"),
-        Card("Gap after", misfit(closure.after), f"{after}; refitted alone {misfit(closure.recalibrated)}"),
+        Card("Gap after", misfit(closure.after), f"{after}: {percent(closure.fraction)} of it explained"),
         Card("Noise alone", percent(closure.noise_floor), "as small as a gap can be"),
-        Card("Explained", percent(closure.fraction), f"of the gap; 95 %: {percent(low)} to {percent(high)}"),
         Card("Probability", share_of(chance_of), remark),
     )
 
@@ -81,15 +81,14 @@ def _selected(listed: list[dict[str, Any]]) -> Block:
             "No kind of effect in the catalogue explains enough of the gap to be believed; the best of them follow."
         )
     note = "Parameters ± one standard deviation of noise. Gap after: NRMSE of the worst sensor, held-out samples."
-    header = ("Selected", "Where", "Parameters", "Law", "Gap after")
+    header = ("Selected", "Parameters", "Law", "Gap after")
     return Table(header, tuple(_selected_row(x) for x in listed), "", note)
 
 
 def _selected_row(x: dict[str, Any]) -> tuple[str | Cell, ...]:
     left = [v for v in x["gap_after"].values() if np.isfinite(v)]
     return (
-        kind_words(x["kind"]),
-        place_words(x["place"]),
+        Cell(kind_words(x["kind"]), place_words(x["place"])),
         Cell(parameters_said(x["parameters"]), tone="wide"),
         Cell(CATALOGUE[x["kind"]].law, tone="wide"),
         misfit(max(left)) if left else MISSING,
@@ -102,7 +101,9 @@ def parameters_said(given: dict[str, Any]) -> str:
     Args:
         given: by name, each with value, std and unit.
     """
-    return "; ".join(_parameter(kind_words(name), p) for name, p in given.items()) or MISSING
+    return (
+        "; ".join(_parameter(kind_words(name.removesuffix("_hz")), p) for name, p in given.items()) or MISSING
+    )
 
 
 def _parameter(name: str, p: dict[str, Any]) -> str:
@@ -119,8 +120,7 @@ def _ranking(found: Diagnosis, own: list[dict[str, Any]], number: int, rounds: i
     open_keys = open_keys if len(open_keys) > 1 else set()
     rows = tuple(
         (
-            kind_words(x["kind"]),
-            place_words(x["place"]),
+            Cell(kind_words(x["kind"]), place_words(x["place"])),
             share_of(x["probability"]),
             Cell(parameters_said(x["parameters"]), tone="wide"),
             significant(x["left"], 3),
@@ -132,9 +132,13 @@ def _ranking(found: Diagnosis, own: list[dict[str, Any]], number: int, rounds: i
         "By the evidence of a fit, that is how well the best parameters explain the samples and how many others would "
         "have done as well. Left: rms of what a fit leaves of the samples it saw, noise = 1."
     )
+    if any(n.degrees == 0 for n in found.examination.noises):
+        note += " That noise was guessed before any effect was known: a fit may leave less."
+    if open_keys:
+        note += f" {OPEN}one of those that these records cannot tell apart."
     title = "" if rounds == 1 else f"{ORDINALS[number - 1]} effect"
     return Table(
-        ("Kind", "Where", "Probability", "Parameters", "Left (noise = 1)", "Not told apart"),
+        ("Kind and place", "Probability", "Parameters", "Left (noise = 1)", "Not told apart from"),
         rows,
         f"All that were tried{f': {title.lower()}' if title else ''}",
         note if number == rounds else "",
@@ -142,10 +146,9 @@ def _ranking(found: Diagnosis, own: list[dict[str, Any]], number: int, rounds: i
 
 
 def _confusable(x: dict[str, Any], open_keys: set) -> str:
-    if key_of(x["kind"], x["place"]) in open_keys:
-        return "● not settled by these records"
     others = [f"{kind_words(y['kind'])} {place_words(y['place'])}" for y in x["confusable_with"][:2]]
-    return ", ".join(others) or MISSING
+    mark = OPEN if key_of(x["kind"], x["place"]) in open_keys else ""
+    return mark + (", ".join(others) or ("the others so marked" if mark else MISSING))
 
 
 def before_after_section(found: Diagnosis) -> Section:
@@ -194,22 +197,31 @@ def closure_section(found: Diagnosis) -> Section:
     if not causes.selected:
         rows.append(_closure_row("chosen model", closure.after, closure.by_sensor, names))
     for i, (x, step) in enumerate(zip(causes.selected, causes.closures, strict=False)):
-        rows.append(
-            _closure_row(f"{'with' if i == 0 else 'and'} {named(x)}", step.after, step.by_sensor, names)
-        )
+        said = Cell(f"{'with' if i == 0 else 'and'} {kind_words(x.kind)}", place_words(x.place))
+        rows.append(_closure_row(said, step.after, step.by_sensor, names))
     rows.append(_closure_row("noise alone", closure.noise_floor, _noise_by_sensor(found, every), names))
     low, high = closure.ci95
     note = (
         f"NRMSE on the last {percent(HELD_OUT)} of every record. Of the nominal model's gap above the noise "
-        f"{percent(closure.fraction)} is gone (95 %: {percent(low)} to {percent(high)}); of what refitting its own "
-        f"numbers leaves, {percent(closure.against_recalibrated)}. Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
+        f"{percent(closure.fraction)} is gone (95 %: {percent(low)} to {percent(high)}); {_next_to_linear(closure)}. "
+        "Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
         "before, a after and n the noise."
     )
+    if causes.noises is not found.examination.noises:
+        note += " The noise is that which the chosen model leaves of the other samples, where tests find nothing in it."
     table = Table(("Model", "All sensors", *names), tuple(rows), "", note)
     return Section("How far it shrinks", (table,))
 
 
-def _closure_row(said: str, pooled: float, each: dict[str, float], names: list[str]) -> tuple[str, ...]:
+def _next_to_linear(closure: Closure) -> str:
+    if closure.recalibrated <= SAME * closure.after:
+        return "refitting its own numbers alone does as well"
+    return f"of what refitting its own numbers leaves, {percent(closure.against_recalibrated)}"
+
+
+def _closure_row(
+    said: str | Cell, pooled: float, each: dict[str, float], names: list[str]
+) -> tuple[str | Cell, ...]:
     return said, misfit(pooled), *(misfit(each[n]) if np.isfinite(each[n]) else MISSING for n in names)
 
 
@@ -247,7 +259,8 @@ def remaining_section(found: Diagnosis) -> Section:
     causes = found.causes
     if causes is None:
         return Section("What remains", ())
-    blocks: list[Block] = [Text(found.remaining)]
+    told = found.remaining.removeprefix("What remains: ")
+    blocks: list[Block] = [Text(told[0].upper() + told[1:])]
     further = causes.rounds[len(causes.selected) :]
     if causes.selected and further and further[0].ranked:
         refused = further[0].ranked[0]

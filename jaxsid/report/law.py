@@ -6,6 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import ERRORS, element_place
 from jaxsid.gap.force_map import ForceMap
@@ -68,32 +69,33 @@ def _sense(effect: Effect, ends: tuple[str, ...]) -> tuple[float, float] | None:
 def _along(
     model: LumpedModel, effect: Effect, force: ForceMap, sign: tuple[float, float]
 ) -> Float[np.ndarray, " samples"] | None:
-    kind = CATALOGUE[effect.kind]
     bare = eqx.tree_at(lambda m: m.effects, model, (effect,), is_leaf=lambda x: x is model.effects)
-    at = nominal_at(slots_of(bare), second_order(model))
-    values = list(parameter_row(effect.kind, effect.parameters, force.record)[: len(kind.parameters)])
-    place, speed = (jnp.asarray(sign[0] * x) for x in (force.displacement, force.velocity))
-    own = Nominal(at.mass[0], at.damping[0], at.stiffness[0])
+    motion = (jnp.asarray(sign[0] * x) for x in (force.displacement, force.velocity))
+    law, inertia = _force(bare, *motion, jnp.asarray(force.time), force.record)
+    return None if float(inertia) else sign[1] * np.asarray(law)
+
+
+@compiled
+def _force(
+    model: LumpedModel, place: Array, speed: Array, time: Array, record: int
+) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
+    """Force of a model's one effect, and mass that it adds: a map knows no acceleration."""
+    (effect,) = model.effects
+    kind = CATALOGUE[effect.kind]
+    at = Nominal(*(x[0] for x in nominal_at(slots_of(model), second_order(model))))
+    values = list(parameter_row(effect.kind, effect.parameters, record)[: len(kind.parameters)])
     if kind.changes is not None:
-        law = _linear(kind, own, values, place, speed)
-    elif kind.slip is not None:
-        law = kind.slip(jnp.abs(speed), *values) * jnp.sign(speed)
-    else:
-        seen = Motion(place, speed, jnp.zeros_like(place), jnp.asarray(force.time), own.stiffness)
-        if kind.rate is not None:
-            seen = seen._replace(memory=_memory(kind, values, seen))
-        assert kind.force is not None
-        law = kind.force(seen, *values) * jnp.ones_like(place)
-    return None if law is None else sign[1] * np.asarray(law)
-
-
-def _linear(kind: Kind, at: Nominal, values: list[Array], place: Array, speed: Array) -> Array | None:
-    """Of added springs and dampers; a map knows no acceleration."""
-    assert kind.changes is not None
-    change = kind.changes(at, *values)
-    if np.any(change.mass) or np.any(change.attached_mass):
-        return None
-    return change.stiffness * place + change.damping * speed
+        change = kind.changes(at, *values)
+        return change.stiffness * place + change.damping * speed, jnp.asarray(
+            change.mass + change.attached_mass
+        )
+    if kind.slip is not None:
+        return kind.slip(jnp.abs(speed), *values) * jnp.sign(speed), jnp.zeros(())
+    seen = Motion(place, speed, jnp.zeros_like(place), time, at.stiffness)
+    if kind.rate is not None:
+        seen = seen._replace(memory=_memory(kind, values, seen))
+    assert kind.force is not None
+    return kind.force(seen, *values) + jnp.zeros_like(place), jnp.zeros(())
 
 
 def _memory(kind: Kind, values: list[Array], seen: Motion) -> Array:

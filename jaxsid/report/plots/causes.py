@@ -28,7 +28,8 @@ from jaxsid.report.style import (
     title,
 )
 
-CLOSE = 300  # samples of a close look
+CLOSE, PART = 300, 4  # samples of a close look: so many, or a part of all
+LEAST = 60  # and no fewer
 SEGMENTS = 8  # that a spectrum is averaged over, half of each shared with the next
 SHORTEST = 64  # samples of one
 DEEPEST = 1e-6  # of the largest value, that is still shown
@@ -106,7 +107,9 @@ def before_after_figure(found: Diagnosis, sensor: str, record: int) -> Figure:
         _name(found, sensor, record), 4.4, rows=3, ratios=(1.0, 1.25, 0.8), between=0.36, left=0.74
     )
     text = _label(found, x.row)
-    near = close_look(x.measured - x.nominal, min(CLOSE, len(x.time)))
+    near = close_look(
+        x.measured - x.nominal, int(np.clip(len(x.time) // PART, min(LEAST, len(x.time)), CLOSE))
+    )
     limit = 1.6 * float(np.abs(x.measured).max())
     for ax, part, width in ((axes[0, 0], slice(None), 0.8), (axes[1, 0], near, 1.2)):
         curves = (
@@ -121,6 +124,7 @@ def before_after_figure(found: Diagnosis, sensor: str, record: int) -> Figure:
         _bounded(ax, x.nominal[part], limit)
         scaled(ax, "y", text, limit)
     legend(axes[0, 0], 3)
+    axes[0, 0].axvspan(x.time[near][0], x.time[near][-1], color=ORANGE, alpha=0.25, linewidth=1, zorder=0)
     for curve, colour in ((x.nominal, ORANGE), (x.chosen, BLUE)):
         left = np.clip(x.measured - curve, -2 * limit, 2 * limit)
         axes[2, 0].plot(*envelope(x.time, left), color=colour, linewidth=0.6)
