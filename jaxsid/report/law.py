@@ -70,8 +70,8 @@ def _along(
     model: LumpedModel, effect: Effect, force: ForceMap, sign: tuple[float, float]
 ) -> Float[np.ndarray, " samples"] | None:
     bare = eqx.tree_at(lambda m: m.effects, model, (effect,), is_leaf=lambda x: x is model.effects)
-    motion = (jnp.asarray(sign[0] * x) for x in (force.displacement, force.velocity))
-    law, inertia = _force(bare, *motion, jnp.asarray(force.time), force.record)
+    place, speed, time = (jnp.asarray(x) for x in (force.displacement, force.velocity, force.time))
+    law, inertia = _force(bare, sign[0] * place, sign[0] * speed, time, force.record)
     return None if float(inertia) else sign[1] * np.asarray(law)
 
 
