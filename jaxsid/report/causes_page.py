@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxsid.gap.closure import HELD_OUT, Closure, Left
 from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.explain import key_of
+from jaxsid.gap.explain import elements_by_key, key_of
 from jaxsid.gap.words import kind_words, named, place_words
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.physical.elements import element_matrices
@@ -21,7 +21,7 @@ from jaxsid.report.numbers import (
     significant,
     with_std,
 )
-from jaxsid.report.plots.causes import before_after_figure, held_out_pairs, spectra_figure
+from jaxsid.report.plots.causes import before_after_figure, chosen_name, held_out_pairs, spectra_figure
 
 RANKED, TESTS, FIGURES = 6, 4, 3
 MOST_SENSORS = 6  # columns of a table
@@ -49,10 +49,13 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
     if found.causes is not None and found.causes.selected and name == "effect":
         chance_of = float(np.prod([x.probability for x in found.causes.selected]))
         remark = "of this explanation, of all that were tried"
-    after = "with the effect" if name == "effect" else "with the best of the catalogue"
     return (
         Card("Gap before", misfit(closure.before), "nominal model, held-out samples (NRMSE)"),
-        Card("Gap after", misfit(closure.after), f"{after}: {percent(closure.fraction)} of it explained"),
+        Card(
+            "Gap after",
+            misfit(closure.after),
+            f"{chosen_name(found)}: {percent(closure.fraction)} of it explained",
+        ),
         Card("Noise alone", percent(closure.noise_floor), "as small as a gap can be"),
         Card("Probability", share_of(chance_of), remark),
     )
@@ -67,6 +70,10 @@ def which_section(found: Diagnosis) -> Section:
     if found.causes is None:
         return Section("Which effect", ())
     blocks: list[Block] = [_selected(found.selected())]
+    if not found.causes.selected and found.verdict != "unknown":
+        blocks.append(
+            Text("All of the model's numbers together explain more than any one of the candidates below.")
+        )
     effects = found.effects()
     rounds = sorted({x["round"] for x in effects})
     for number in rounds:
@@ -195,7 +202,7 @@ def closure_section(found: Diagnosis) -> Section:
     rows = [_closure_row("nominal model", closure.before, nominal, names)]
     rows.append(_closure_row("its own numbers refitted", closure.recalibrated, linear, names))
     if not causes.selected:
-        rows.append(_closure_row("chosen model", closure.after, closure.by_sensor, names))
+        rows.append(_closure_row(chosen_name(found), closure.after, closure.by_sensor, names))
     for i, (x, step) in enumerate(zip(causes.selected, causes.closures, strict=False)):
         said = Cell(f"{'with' if i == 0 else 'and'} {kind_words(x.kind)}", place_words(x.place))
         rows.append(_closure_row(said, step.after, step.by_sensor, names))
@@ -301,17 +308,18 @@ def numbers_section(found: Diagnosis) -> Section:
     fit, elements = found.causes.chosen.fit, element_matrices(found.nominal)
     nominal, alone = np.asarray(elements.nominal), np.asarray(found.examination.elements.values)
     root = np.sqrt(np.maximum(np.diag(np.asarray(fit.covariance)), 0.0))
+    named_wrong = {key_of(x["kind"], x["place"]) for x in found.selected()}
+    wrong_rows = {i for key, own in elements_by_key(found.nominal).items() if key in named_wrong for i in own}
     rows = []
     for i, element in enumerate(elements.listed):
         value, std = float(nominal[i] * (1 + fit.theta[i])), float(abs(nominal[i]) * root[i])
-        wrong = i in found.causes.chosen.hypothesis.wrong
         moved = change(value, float(nominal[i]))
         rows.append(
             (
                 element.name,
                 significant(float(nominal[i])),
                 with_std(value, std) if nominal[i] else MISSING,
-                Cell(moved, tone="warning") if wrong else moved,
+                Cell(moved, tone="warning") if i in wrong_rows else moved,
                 significant(float(alone[i])),
             )
         )
@@ -319,5 +327,5 @@ def numbers_section(found: Diagnosis) -> Section:
         "Fitted together with the effects, within the model's tolerance; those marked were singled out as wrong. ± one "
         "standard deviation. On the right the best numbers without any effect, which take up a part of what is missing."
     )
-    header = ("Element", "Nominal", "In model.toml", "Change", "Without the effects")
+    header = ("Element", "Nominal", "In model.toml", "Change", "Without effects")
     return Section("The model's numbers", (Table(header, tuple(rows), "", note),))

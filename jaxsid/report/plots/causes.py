@@ -73,6 +73,19 @@ def held_out(found: Diagnosis, sensor: str, record: int) -> HeldOut:
     return HeldOut(time, measured, nominal, chosen, causes.noises[record], row, float(given.dt))
 
 
+def chosen_name(found: Diagnosis) -> str:
+    """What the chosen model is, in a few words.
+
+    Args:
+        found: a diagnosis with causes.
+    """
+    if found.causes is None or not found.causes.selected:
+        return "numbers put right"
+    if found.verdict == "unknown":
+        return "best of the catalogue"
+    return "with the effect" if len(found.causes.selected) == 1 else "with the effects"
+
+
 def held_out_pairs(found: Diagnosis, most: int) -> Sequence[tuple[str, int]]:
     """Sensor and record of the largest gaps of the nominal model, relative to the signal, on held-out samples.
 
@@ -115,7 +128,7 @@ def before_after_figure(found: Diagnosis, sensor: str, record: int) -> Figure:
         curves = (
             (x.measured, MUTED, 1.9, "measured"),
             (x.nominal, ORANGE, 0.9, "nominal"),
-            (x.chosen, BLUE, 0.9, "with the effect"),
+            (x.chosen, BLUE, 0.9, chosen_name(found)),
         )
         for curve, colour, line, said in curves:
             look = {"color": colour, "linewidth": line * width, "label": said}
@@ -154,7 +167,7 @@ def spectra_figure(found: Diagnosis, sensor: str, record: int) -> Figure:
         top=0.74,
     )
     f, measured = density(x.measured, x.dt)
-    models = ((x.nominal, ORANGE, "nominal"), (x.chosen, BLUE, "with the effect"))
+    models = ((x.nominal, ORANGE, "nominal"), (x.chosen, BLUE, chosen_name(found)))
     upper = [(density(y, x.dt)[1], colour, 1.0, said) for y, colour, said in models]
     lower = [(density(x.measured - y, x.dt)[1], colour, 1.0, said) for y, colour, said in models]
     noise = x.noise.deviation(2 * np.pi * f, x.dt)[:, x.row] * np.sqrt(2 * x.dt)
