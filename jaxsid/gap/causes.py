@@ -42,6 +42,7 @@ class Causes(NamedTuple):
         closures: of every selected effect together with those before it, on held-out samples; of the model within
             its tolerance where none was selected.
         left: what the chosen model leaves of these.
+        before: what the nominal model and the best linear one leave of these.
         noises: of each record, from what the chosen model leaves where tests find nothing in it.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
@@ -57,6 +58,7 @@ class Causes(NamedTuple):
     noises: tuple[Noise, ...]
     remaining: Null
     places: Scored | None
+    before: tuple[Left, Left]
 
 
 class _Look(NamedTuple):
@@ -133,6 +135,7 @@ def causes_of(
         floor,
         look.null,
         look.scored,
+        ends,
     )
 
 

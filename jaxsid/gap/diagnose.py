@@ -128,15 +128,18 @@ class Diagnosis(NamedTuple):
         ]
 
     def effects(self) -> list[dict[str, Any]]:
-        """Candidates of the rounds in which an effect was found, most probable first."""
+        """Candidates of the rounds in which an effect was found, most probable first.
+
+        Each with the number of its round, and the rms in noise that its fit leaves.
+        """
         if self.causes is None:
             return []
         count = max(len(self.causes.selected), 1)
-        best: dict[Key, tuple[Explanation, Ranking]] = {}
-        for ranking in self.causes.rounds[:count]:
+        best: dict[Key, tuple[Explanation, Ranking, int]] = {}
+        for number, ranking in enumerate(self.causes.rounds[:count], start=1):
             for x in ranking.ranked:
                 if x.key not in best or best[x.key][0].probability < x.probability:
-                    best[x.key] = x, ranking
+                    best[x.key] = x, ranking, number
         order = sorted(best.values(), key=lambda pair: -pair[0].probability)
         return [
             {
@@ -146,8 +149,10 @@ class Diagnosis(NamedTuple):
                 "confusable_with": [
                     as_pair(y) for y in ranking.ranked if y.key != x.key and alike(x, y, ranking)
                 ],
+                "round": number,
+                "left": float(np.sqrt(x.refit.fit.squares / max(x.refit.fit.equations, 1))),
             }
-            for x, ranking in order
+            for x, ranking, number in order
         ]
 
     def selected(self) -> list[dict[str, Any]]:
