@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from jaxsid.gap.refit import Bench, Hypothesis, Refit, refitted, weighed_anew
 from jaxsid.gap.screen import Candidate
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
@@ -173,11 +174,22 @@ def rank(
     return _ranked(every, without, bench)
 
 
+def _sensible(found: Refit) -> bool:
+    """Whether each law has parameters that it is meant for."""
+    for effect in found.hypothesis.effects:
+        kind = CATALOGUE[effect.kind]
+        values = (float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters)
+        if kind.sensible is not None and not kind.sensible(*values):
+            return False
+    return True
+
+
 def _elements(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
     return found.fit.theta[: len(bench.tolerance)]
 
 
 def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench) -> Ranking:
+    every = [(c, r, e if _sensible(r) else -math.inf) for c, r, e in every]
     every = sorted(every, key=lambda x: -x[2])
     first = every[0][1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)

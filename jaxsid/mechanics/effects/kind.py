@@ -116,6 +116,7 @@ class Kind(NamedTuple):
         rate: derivative of the memory in time, from a `Motion`.
         slip: magnitude of dry friction, F = slip sign(v), from the speed; at rest it balances up to slip(0).
         states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
+        sensible: whether parameters, in their order, are what the law is meant for, where their least values do not say.
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
     """
 
@@ -130,6 +131,7 @@ class Kind(NamedTuple):
     rate: Callable[..., Any] | None = None
     slip: Callable[..., Any] | None = None
     states: int = 0
+    sensible: Callable[..., bool] | None = None
     needs: Literal["", "joined", "apart"] = ""
 
 
