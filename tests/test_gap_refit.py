@@ -66,7 +66,7 @@ def test_blocks_judge_every_sample_once(samples, begin):
             padded = np.where(at < 0, 0.0, own_u[np.clip(at, 0, len(own_u) - 1), 0])
             np.testing.assert_array_equal(np.asarray(block.u)[w, :, 0], padded)
     assert sorted(judged[0]) == list(range(begin, samples))
-    assert sorted(judged[1]) == list(range(900))
+    assert sorted(judged[1]) == list(range(min(900, samples)))
 
 
 def test_absent_sensors_and_gaps_have_no_weight():
@@ -105,11 +105,10 @@ def test_unknowns_and_parameters_undo_each_other(kind):
         ratio = {}
         for i, p in enumerate(of):  # from the definitions
             prior = p.prior
-            ratio[p.name] = {
-                "uniform": z[0, i],
-                "normal": prior.centre + prior.spread * z[0, i],
-                "log-normal": prior.centre * prior.spread ** z[0, i],
-            }[prior.shape]
+            if prior.shape == "log-normal":
+                ratio[p.name] = prior.centre * prior.spread ** z[0, i]
+            else:
+                ratio[p.name] = z[0, i] if prior.shape == "uniform" else prior.centre + prior.spread * z[0, i]
         for i, p in enumerate(of):
             at = Amplitudes(*(float(x[0]) for x in AMPLITUDES))
             scale = float(p.scale.of(at)) ** (ratio[p.raised] if p.raised else 1)
@@ -335,6 +334,7 @@ def test_two_effects_at_once(cubic):
     assert found.fit.squares / found.fit.equations == pytest.approx(1, abs=0.08)
 
 
+@pytest.mark.slow
 def test_coulomb_friction_is_recovered():
     """Well damped and short: the reference goes from event to event."""
     ends = ("ground", *BODIES)
