@@ -153,7 +153,7 @@ def screened(model, records, **more):
     refit = recalibrated(model, records, noises, wide=False, given=True)
     own = scores(model, settings, places, tolerance).explained
     motions = {"own": [x.motion for x in own], "refit": [x.motion for x in refit.linear]}
-    left = [np.asarray(x.left) for x in refit.linear]
+    left = [np.abs(np.asarray(x.left)) for x in refit.linear]
     return screen(model, settings, places, motions, tolerance, left, **more)
 
 
@@ -191,5 +191,5 @@ def test_lone_frequencies_are_those_of_a_sine(calm):
     given = setting_of(spectra, np.ones(spectra.y.shape), element_directions(model), slowest_rate(model))
     t = FINE * np.arange(SAMPLES)
     left = np.random.default_rng(0).standard_normal(plain.shape) + np.sin(2 * np.pi * 31.3 * t)[:, None]
-    found = lone_frequencies([given], [np.fft.rfft(left, axis=0) / np.sqrt(SAMPLES)])
+    found = lone_frequencies([given], [np.abs(np.fft.rfft(left, axis=0)) / np.sqrt(SAMPLES)])
     assert np.abs(found - 31.3).min() < 0.07

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from jaxsid.checks import require
 from jaxsid.gap.dictionary import products, sizes
@@ -74,7 +74,7 @@ def screen(
     places: tuple[Place, ...],
     motions: Mapping[str, Sequence[Motion]],
     tolerance: Float[np.ndarray, " e"],
-    left: Sequence[Complex[np.ndarray, "_ _"]],
+    left: Sequence[Float[np.ndarray, "_ _"]],
     *,
     kinds: Sequence[str] | None = None,
 ) -> tuple[Candidate, ...]:
@@ -239,19 +239,19 @@ def _counting(own: Float[np.ndarray, "grid k k"]) -> Float[np.ndarray, "grid k"]
 
 
 def lone_frequencies(
-    settings: Sequence[Setting], left: Sequence[Complex[np.ndarray, "_ _"]]
+    settings: Sequence[Setting], left: Sequence[Float[np.ndarray, "_ _"]]
 ) -> Float[np.ndarray, " f"]:
     """Frequencies, Hz, about the lines that stand out most from those around them.
 
     Args:
         settings: of each record.
-        left: what a model leaves of each.
+        left: size of the lines that a model leaves of each.
     """
     around = np.ones(2 * AROUND + 1)
     around[AROUND - 1 : AROUND + 2] = 0.0
     strongest: list[tuple[float, float, float]] = []
     for setting, lines in zip(settings, left, strict=True):
-        power = ((np.abs(lines) * np.asarray(setting.scale)) ** 2).sum(axis=1)
+        power = ((lines * np.asarray(setting.scale)) ** 2).sum(axis=1)
         used = (np.asarray(setting.spectra.weight) == 1) * 1.0
         beside = np.convolve(power * used, around, mode="same") / np.maximum(
             np.convolve(used, around, "same"), 1

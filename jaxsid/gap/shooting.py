@@ -211,7 +211,7 @@ def fitted(
     """
     at = _evaluated(shot, blocks, prior, theta, list(states), substeps)
     damping, growth, settled, done = DAMPING, 2.0, False, 1
-    while done < steps:
+    while done < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, damping)
         new = np.maximum(at.theta + move, prior.least)
         found = _evaluated(
@@ -307,7 +307,7 @@ def _unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _log_determinant(matrix: np.ndarray) -> np.ndarray:
     scale, scaled = _unit(matrix)
-    return 2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1]
+    return np.asarray(2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1])
 
 
 def _concluded(at: _At, blocks: Sequence[Block], prior: Prior, steps: int, settled: bool) -> Fit:
