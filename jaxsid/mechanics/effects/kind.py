@@ -116,7 +116,7 @@ class Kind(NamedTuple):
         rate: derivative of the memory in time, from a `Motion`.
         slip: magnitude of dry friction, F = slip sign(v), from the speed; at rest it balances up to slip(0).
         states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
-        sensible: whether parameters, in their order, are what the law is meant for, where their least values do not say.
+        sensible: whether parameters, in their order, are such as the law is meant for; least values apart.
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
     """
 
