@@ -14,7 +14,7 @@ from jaxsid.gap.free_run import free_run
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.null import Null, left_share, null_test
+from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
@@ -70,8 +70,7 @@ class _Look(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        small = max(NEGLIGIBLE, SLIGHT * left_share(self.fit))
-        return self.null.p_value >= SIGNIFICANT or self.null.share <= small
+        return self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE
 
 
 def causes_of(
@@ -99,8 +98,9 @@ def causes_of(
     rounds: list[Ranking] = []
     selected: list[Explanation] = []
     before: Refit | None = None
+    first = candidates = _candidates(look)
     while len(selected) < MOST_EFFECTS:
-        ranking = rank(bench, _candidates(look), before, say)
+        ranking = rank(bench, candidates, before, say)
         rounds.append(ranking)
         bench, noises = ranking.bench, ranking.bench.noises
         if not ranking.ranked or not _worth(ranking):
@@ -112,6 +112,8 @@ def causes_of(
         look = _looked(model, seen, noises, bench, before)
         if look.clear or look.scored is None:
             break
+        # what came next to the first effect, in turn with what now comes first
+        candidates = tuple(c for pair in zip(_candidates(look), first[1:], strict=False) for c in pair)
     chosen = before if before is not None else rounds[0].without
     linear = refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))))
     if found.finding == "parameters" and _beyond(linear, chosen, rounds[-1].scale):

@@ -35,7 +35,7 @@ class Effort(NamedTuple):
     steps: int
 
 
-FIRST, FURTHER = Effort(10, 4, 25), Effort(5, 2, 10)  # with two effects a step costs several times as much
+FIRST, FURTHER = Effort(10, 4, 25), Effort(8, 2, 12)  # with two effects a step costs several times as much
 
 
 class Explanation(NamedTuple):
@@ -226,7 +226,11 @@ def _distinct(
     """Candidates that the hypothesis does not have yet."""
     there = {key_of(e.kind, dict(e.place)) for e in base.effects}
     there |= {key for key, rows in errors.items() if set(rows) <= set(base.wrong)}
-    return [c for c in candidates if key_of(c.kind, c.place) not in there]
+    found: dict[Key, Candidate] = {}
+    for c in candidates:
+        if (key := key_of(c.kind, c.place)) not in there:
+            found.setdefault(key, c)
+    return list(found.values())
 
 
 def extended(base: Hypothesis, c: Candidate, errors: Mapping[Key, tuple[int, ...]]) -> Hypothesis:
