@@ -23,7 +23,7 @@ def free_run(
     record: int,
     first: int,
     substeps: int,
-) -> Float[np.ndarray, "samples outputs"]:
+) -> Float[np.ndarray, "rows outputs"]:
     """Readings from a sample on, one row for it and each after it.
 
     Args:
