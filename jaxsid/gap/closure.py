@@ -227,6 +227,7 @@ def _by_piece(x: Left, *, centred: bool = False) -> np.ndarray:
     """(records * pieces, outputs) sums of squares."""
     found = []
     for left in x.left:
-        values = left - np.nanmean(left, axis=0) if centred else left
+        mean = np.nansum(left, axis=0) / np.maximum(np.isfinite(left).sum(axis=0), 1)
+        values = left - mean if centred else left
         found += [np.nansum(part**2, axis=0) for part in np.array_split(values, PIECES)]
     return np.array(found)
