@@ -231,6 +231,9 @@ def demo(
         "demo"
     ),
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    later: Annotated[
+        bool, typer.Option(help="Diagnose a later record too, of the rig with friction; this takes minutes.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """The whole story on the built-in rig: identify it, then find what is the matter with it later."""
@@ -239,14 +242,15 @@ def demo(
         _numerics()
         from jaxsid.demo import LATER, run_demo, run_later
 
-        found = run_demo(out, seed, say)
-        _write(found, out, say, later=f"{LATER}/report.html")
-        if not quiet:
-            _summary(found, out)
-        changed = run_later(found, out / LATER, seed, say)
-        _write_diagnosis(changed, out / LATER, say)
+        found, changed = run_demo(out, seed, say), None
+        _write(found, out, say, later=f"{LATER}/report.html" if later else None)
+        if later:
+            changed = run_later(found, out / LATER, seed, say)
+            _write_diagnosis(changed, out / LATER, say)
     if not quiet:
-        _diagnosis_summary(changed, out / LATER)
+        _summary(found, out)
+        if changed is not None:
+            _diagnosis_summary(changed, out / LATER)
 
 
 @app.command()

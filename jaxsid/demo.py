@@ -50,7 +50,7 @@ def run_later(found: Identification, out: Path, seed: int, say: Callable[[str], 
     """
     say("simulating the rig again: its motor has begun to rub")
     model = later_model(found)
-    record = rig_record(seed + 1, demand=later_torque(seed), friction=FRICTION)
+    record = rig_record(seed + 1, demand=later_torque(seed), friction=FRICTION, torque_noise=0.0)
     with atomic_directory(out) as draft:
         write_model(model, draft / "nominal.toml", header="The rig as it was identified.")
         write_record(record, draft / "record.csv")
