@@ -1,15 +1,33 @@
 """A diagnosis in sentences: the finding, what remains, what to measure next."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, runtime_checkable
 
+from jaxsid.gap.causes import Causes
+from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import Explanation
 from jaxsid.gap.measure import Gap
 from jaxsid.gap.places import Place
-
-if TYPE_CHECKING:
-    from jaxsid.gap.diagnose import Diagnosis
+from jaxsid.gap.verdict import Verdict
+from jaxsid.mechanics.lumped import LumpedModel
 
 APART = 1.5  # gap in noise from which on refitted numbers are worth a word
+
+
+@runtime_checkable
+class Found(Protocol):
+    """What the sentences need of a diagnosis."""
+
+    @property
+    def nominal(self) -> LumpedModel: ...
+    @property
+    def examination(self) -> Examination: ...
+    @property
+    def causes(self) -> Causes | None: ...
+    @property
+    def judgement(self) -> Verdict: ...
+    @property
+    def verdict(self) -> str: ...
+    def selected(self) -> list[dict[str, Any]]: ...
 
 
 def kind_words(kind: str) -> str:
@@ -43,7 +61,7 @@ def percent(x: float) -> str:
     return f"{100 * x:.2g} %"
 
 
-def summary(found: "Diagnosis") -> tuple[str, str]:
+def summary(found: Found) -> tuple[str, str]:
     """The verdict and what it means, a sentence each.
 
     Args:
@@ -82,7 +100,7 @@ def _place(place: Place) -> str:
     return " - ".join(place.ends) if place.where == "between" else f"{place.where} {place.ends[0]}"
 
 
-def _sentence(found: "Diagnosis", number: int) -> str:
+def _sentence(found: Found, number: int) -> str:
     assert found.causes is not None
     x = found.causes.selected[number]
     given = found.selected()[number]["parameters"]
@@ -96,7 +114,7 @@ def _value(name: str, p: dict[str, Any]) -> str:
     return f"{kind_words(name)} {value:.4g} ± {p['std']:.2g}{unit}"
 
 
-def remaining(found: "Diagnosis") -> str:
+def remaining(found: Found) -> str:
     """What is left once the selected effects are added.
 
     Args:
@@ -127,7 +145,7 @@ def _loudest(gap: Gap) -> str:
     return f"{low:.3g} to {high:.3g} Hz"
 
 
-def next_experiment(found: "Diagnosis") -> str:
+def next_experiment(found: Found) -> str:
     """What to measure next.
 
     Args:
