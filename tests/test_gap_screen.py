@@ -176,6 +176,7 @@ def test_truth_is_among_the_first_with_its_parameters(kind, at, place, parameter
     assert own.left < 3
 
 
+@pytest.mark.slow
 def test_records_of_different_lengths_count_together():
     kind, at, place, parameters = TRUE[0]
     records = []
