@@ -11,7 +11,7 @@ from jaxsid.gap.explain import Explanation
 from jaxsid.gap.null import left_share
 
 LIKELY = 0.9  # probability that the explanations named have together
-ENOUGH = 0.75  # part of the best linear model's gap, on held-out samples, below which nothing explains it
+ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 
 
@@ -53,7 +53,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
 
 def _slight(found: Examination) -> bool:
     """Whether what tests find is small beside the noise, so that no law could be told from it."""
-    return found.null.share < SLIGHT * left_share(found.fit)
+    return bool(found.null.share < SLIGHT * left_share(found.fit))
 
 
 def _unexplained(causes: Causes) -> float:
