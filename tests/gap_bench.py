@@ -58,6 +58,7 @@ def bench(y, level, u=None, model=None, wide=False):
         100.0 * still,
         1,
         2,
+        (known(level),),
     )
 
 

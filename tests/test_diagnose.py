@@ -135,6 +135,7 @@ def test_the_summary(cubic, capsys):
     assert "Where it arises" in told
 
 
+@pytest.mark.slow
 def test_wrong_numbers_are_named():
     u = drive()
     found = diagnose(chain(factor=1.05), record(u, noisy(exact(u))))

@@ -23,7 +23,7 @@ from jaxsid.gap.explain import (
     key_of,
 )
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
-from jaxsid.gap.refit import Hypothesis, Refit
+from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
 from jaxsid.gap.shooting import Fit
 from jaxsid.gap.verdict import verdict_of
@@ -31,6 +31,9 @@ from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_
 from jaxsid.physical.elements import element_matrices
 
 B12, B23 = {"between": ("b1", "b2")}, {"between": ("b2", "b3")}
+
+
+BENCH = Bench(chain(), (), (), (), np.zeros(9), np.zeros(9), np.zeros(6), 1, 2, ())  # of no matter here
 
 
 def refit(evidence, squares=1000.0, equations=1000, hypothesis=None):
@@ -48,7 +51,7 @@ def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
     every = [
         (candidate(*kinds[i]), refit(e, squares), e) for i, e in enumerate(evidences) if not math.isnan(e)
     ]
-    return _ranked(every, refit(without))
+    return _ranked(every, refit(without), BENCH)
 
 
 # keys and numbers
@@ -156,7 +159,7 @@ def test_probabilities_are_tempered_evidences():
 def test_no_effect_at_all_is_an_alternative_too():
     found = ranking(0.0, without=0.0)
     assert found.ranked[0].probability == pytest.approx(0.5)
-    assert _ranked([], refit(0.0)).ranked == ()
+    assert _ranked([], refit(0.0), BENCH).ranked == ()
 
 
 def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
@@ -170,7 +173,7 @@ def test_a_further_effect_must_be_worth_it():
     def worth(gain, less, before=3000.0):
         best, without = refit(gain, before - less), refit(0.0, before)
         one = Explanation("backlash", B12, best, gain, 1.0)
-        return _worth(Ranking((one,), without, 1.0))
+        return _worth(Ranking((one,), without, 1.0, BENCH))
 
     assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
     assert not worth(0.99 * WORTH * TEMPERATURE, 210.0)
@@ -196,7 +199,10 @@ def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
 def causes(*rounds, closures):
     chosen = [r.ranked[0] for r in rounds][: len(closures)]
     last = chosen[-1].refit
-    return Causes(rounds, last, tuple(chosen), last, last, tuple(closures), Left((), ()), (), None, None)
+    nothing = Left((), ())
+    return Causes(
+        rounds, last, tuple(chosen), last, last, tuple(closures), nothing, (), None, None, (nothing, nothing)
+    )
 
 
 def test_none():

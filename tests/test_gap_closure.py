@@ -34,7 +34,8 @@ def run(of, effects, u, *, first=0, state=None, changes=0.0, substeps=2):
     theta = np.concatenate([np.full(9, changes), z.ravel()])
     state = np.zeros(6 + 2 * shot.slots.count) if state is None else state
     ramps = jnp.zeros(1, bool)
-    return free_run(shot, theta, u[:, None], ramps, DT, state, record=0, first=first, substeps=substeps)
+    given = {"record": 0, "first": first, "substeps": substeps}
+    return free_run(shot, theta, u[:, None], ramps, DT, state, **given).outputs
 
 
 def test_a_linear_run_is_exact(of):
@@ -163,13 +164,13 @@ def test_a_quarter_is_held_out():
 
 @pytest.mark.parametrize("windowed", [False, True])
 def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
-    """Its initial states there, one or one a window, are found from the held-out samples themselves."""
+    """Its run goes on from the last window that was fitted, or begins anew in every window."""
     u = drive(4 * SAMPLES)
     y, level = colored(exact(u), 0)
     frozen = of._replace(tolerance=np.full(9, FIXED))
     data = record(u, y[:, :2], kinds=((0, ""), (1, "")))
     noise = known(np.append(level[:2], np.nan))
-    found = left_of(refitted(frozen, Hypothesis()), frozen, [data], [noise], windowed=windowed)
+    found = left_of(refitted(frozen, Hypothesis()), frozen, [data], windowed=windowed)
     (left,), (measured,) = found
     assert left.shape == measured.shape == (SAMPLES, 3)
     assert np.isnan(left[:, 2]).all()
@@ -185,7 +186,7 @@ def test_windows_begin_anew():
     wrong = bench(y[:SAMPLES], level, u=u[:SAMPLES], model=chain(factor=1.05))
     frozen = wrong._replace(tolerance=np.full(9, FIXED))
     found = refitted(frozen, Hypothesis())
-    given = found, frozen, [record(u, y)], [known(level)]
+    given = found, frozen, [record(u, y)]
     free, windows = (np.sqrt((left_of(*given, windowed=x).left[0] ** 2).mean(axis=0)) for x in (False, True))
     assert (windows < 0.98 * free).all()
     assert (windows > 2 * known(level).rms()).all()

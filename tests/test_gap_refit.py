@@ -184,6 +184,7 @@ def test_linear_elements_agree_with_an_independent_fit(straight):
     assert found.fit.settled
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_twenty_seeds():
     values = np.concatenate([MASS, DAMPING, STIFFNESS])
     model = chain(factor=1.02)

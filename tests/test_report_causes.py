@@ -21,6 +21,9 @@ from jaxsid.report.plots.causes import (
 )
 from jaxsid.report.plots.places import map_figure
 
+# the page as a whole is looked at by the quick tests of the diagnosis
+pytestmark = pytest.mark.slow
+
 COEFFICIENT = 1e6
 
 

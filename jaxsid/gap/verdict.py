@@ -40,7 +40,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if causes is None:
         some = 0.5 * math.exp(-doubt / 0.05)
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
-    if not causes.selected and _slight(found):
+    if found.finding == "structure" and not causes.selected and _slight(found):
         return Verdict("none", {"none": 0.5, "effect": 0.25, "unknown": 0.25}, ())
     unexplained = _unexplained(causes)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
