@@ -142,8 +142,11 @@ def causes_of(
 
 
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
-    """Whether all of the model's numbers together explain more than the few that were singled out."""
-    return (linear.fit.evidence - chosen.fit.evidence) / scale / TEMPERATURE > WORTH
+    """Whether all of the model's numbers together explain more than the few that were singled out.
+
+    Not tempered: where they leave noise there is nothing that no hypothesis has.
+    """
+    return (linear.fit.evidence - chosen.fit.evidence) / scale > WORTH
 
 
 def _worth(ranking: Ranking) -> bool:
