@@ -8,7 +8,7 @@ FIGURES := build/bench
 STAMP := $(VENV)/.installed
 CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable
 
-.PHONY: setup demo lint test test-all bench bench-refine bench-effects bench-calibration docs notebooks clean
+.PHONY: setup demo lint test test-all bench bench-refine bench-effects bench-calibration blind docs notebooks clean
 
 setup: $(STAMP)
 
@@ -45,6 +45,14 @@ bench-effects: $(STAMP)
 
 bench-calibration: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py
+
+# Diagnoses of systems whose effects are withheld; goes on where it stopped. Cases and results stay in build/blind.
+blind: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/blind/generate.py build/blind --set test --cases 240
+	$(BIN)/python benchmarks/blind/run.py build/blind
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/blind/baselines.py build/blind
+	$(BIN)/python benchmarks/blind/score.py build/blind
+	$(BIN)/python benchmarks/blind/figures.py build/blind build/blind/figures
 
 $(PEERS)/.installed: $(STAMP) benchmarks/constraints.txt
 	$(BIN)/python -m venv --clear $(PEERS)

@@ -147,7 +147,7 @@ def diagnose(
     ] = Initial.estimate,
     quiet: Quiet = False,
 ) -> None:
-    """Where the model and the records part: is it noise, how large is it, and at which place does it arise."""
+    """Where the model and the records part, which effect causes it, and how far the gap shrinks with that effect."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
@@ -159,10 +159,7 @@ def diagnose(
         found = run(nominal, read_records(records, nominal), initial=initial.value, progress=say)
         _write_diagnosis(found, out, say)
     if not quiet:
-        from jaxsid.report.diagnosis_summary import print_diagnosis
-
-        print_diagnosis(found)
-        typer.echo(f"\nWritten to {out}: diagnosis.json, model.toml, forces.npz, report.html")
+        _diagnosis_summary(found, out)
 
 
 @app.command()
@@ -234,18 +231,26 @@ def demo(
         "demo"
     ),
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    later: Annotated[
+        bool, typer.Option(help="Diagnose a later record too, of the rig with friction; this takes minutes.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """The whole story on the built-in rig: a servo motor drives discs through a gearbox."""
+    """The whole story on the built-in rig: identify it, then find what is the matter with it later."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
-        from jaxsid.demo import run_demo
+        from jaxsid.demo import LATER, run_demo, run_later
 
-        found = run_demo(out, seed, say)
-        _write(found, out, say)
+        found, changed = run_demo(out, seed, say), None
+        _write(found, out, say, later=f"{LATER}/report.html" if later else None)
+        if later:
+            changed = run_later(found, out / LATER, seed, say)
+            _write_diagnosis(changed, out / LATER, say)
     if not quiet:
         _summary(found, out)
+        if changed is not None:
+            _diagnosis_summary(changed, out / LATER)
 
 
 @app.command()
@@ -373,7 +378,7 @@ def _method(choice: Method, records, say):
     return {Method.fourier: Fourier, Method.direct: Direct, Method.wavelet: Wavelet}[choice]()
 
 
-def _write(found, out: Path, say) -> None:
+def _write(found, out: Path, say, later: str | None = None) -> None:
     """All files, or none."""
     from jaxsid.files.atomic import atomic_directory
     from jaxsid.files.model_toml import write_model
@@ -388,7 +393,7 @@ def _write(found, out: Path, say) -> None:
             write_model(
                 found.identified, draft / "model.toml", header="Identified by jaxsid from measured records."
             )
-        write_report(found, draft / "report.html")
+        write_report(found, draft / "report.html", later=later)
 
 
 def _write_diagnosis(found, out: Path, say) -> None:
@@ -403,9 +408,9 @@ def _write_diagnosis(found, out: Path, say) -> None:
     with atomic_directory(out) as draft:
         write_json(draft / "diagnosis.json", found.as_dict())
         write_model(
-            found.examination.refit,
+            found.model,
             draft / "model.toml",
-            header="Numbers refitted by jaxsid to measured records.",
+            header="Numbers refitted and effects found by jaxsid in measured records.",
         )
         write_forces(found, draft / "forces.npz")
         write_diagnosis_report(found, draft / "report.html")
@@ -417,6 +422,13 @@ def _summary(found, out: Path) -> None:
     print_summary(found)
     names = ["identification.json", *(["model.toml"] if found.identified is not None else []), "report.html"]
     typer.echo(f"\nWritten to {out}: {', '.join(names)}")
+
+
+def _diagnosis_summary(found, out: Path) -> None:
+    from jaxsid.report.diagnosis_summary import print_diagnosis
+
+    print_diagnosis(found)
+    typer.echo(f"\nWritten to {out}: diagnosis.json, model.toml, forces.npz, report.html")
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from jax.experimental import serialize_executable
 P = ParamSpec("P")
 T = TypeVar("T")
 MOST_BYTES = 500_000_000  # what the folder may hold before the programs unused for longest go
+FULL: dict[str, bool | str | int] = {"xla_backend_optimization_level": 3}
 HURRIED: dict[str, bool | str | int] = {"xla_backend_optimization_level": 0}
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_debug_nans")
 LEAST_TIME = "jax_persistent_cache_min_compile_time_secs"
@@ -107,6 +108,15 @@ def release_programs(most_maps: int = 20_000) -> None:
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """As `equinox.filter_jit`: arrays are traced, all else is static; kept on disk after `keep_programs`."""
+    return _kept_on_disk(function, {})
+
+
+def compiled_in_full(function: Callable[P, T]) -> Callable[P, T]:
+    """As `compiled`, with all optimizations even in a hurry: for programs that run long or many times."""
+    return _kept_on_disk(function, FULL)
+
+
+def _kept_on_disk(function: Callable[P, T], own: dict[str, bool | str | int]) -> Callable[P, T]:
     jitted = eqx.filter_jit(function)
     programs: dict[bytes, _Program] = {}
     _in_memory.append(programs)
@@ -116,16 +126,15 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
         if _kept is None:
             return jitted(*args, **kwargs)
         leaves, tree = jax.tree.flatten((args, kwargs))
-        key = _key(function, leaves, tree, _kept)
+        options = {**_kept.options, **own}
+        key = _key(function, leaves, tree, _kept._replace(options=options))
         if key is None:
             return jitted(*args, **kwargs)
         program = programs.get(key)
         if program is None:
             path = _kept.path / key.hex()
             with _one_at_a_time:
-                program = (
-                    programs.get(key) or _read(path) or _compile(function, leaves, tree, path, _kept.options)
-                )
+                program = programs.get(key) or _read(path) or _compile(function, leaves, tree, path, options)
                 programs[key] = program
         outputs = program.run(*(x for x in leaves if eqx.is_array(x)))
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Place) else x, program.result)

@@ -8,9 +8,9 @@ from report_fixture import chain
 
 from jaxsid.examples.systems import one_dof, rig, three_dof
 from jaxsid.mechanics.lumped import lumped_model
+from jaxsid.mechanics.units import units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.numbers import change, percent, significant, with_std
-from jaxsid.report.units import units_of
 
 
 def read(text: str) -> float:

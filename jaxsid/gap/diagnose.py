@@ -6,16 +6,31 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsid.checks import require
+from jaxsid.gap.causes import Causes, causes_of
+from jaxsid.gap.closure import Closure, held_out_begin, seen_part
 from jaxsid.gap.examine import Examination, examine
+from jaxsid.gap.explain import (
+    ERRORS,
+    Explanation,
+    Key,
+    Ranking,
+    alike,
+    element_place,
+    elements_by_key,
+    key_of,
+)
 from jaxsid.gap.noise import SOURCES
+from jaxsid.gap.refit import Refit
+from jaxsid.gap.spectra import FEWEST
+from jaxsid.gap.verdict import Verdict, as_pair, plain_place, verdict_of
+from jaxsid.gap.words import next_experiment, remaining, summary
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.first_order import physical_displacement_velocity
-from jaxsid.mechanics.lumped import GROUND, LumpedModel, second_order
-from jaxsid.physical.elements import Element
+from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.mechanics.units import units_of
+from jaxsid.physical.elements import element_matrices
 from jaxsid.records import Record
 
-VERDICTS = {"agreement": "none", "parameters": "effect", "structure": "unknown"}
-KINDS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
-APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 SURE = 3.0  # standard deviations from which on an element's change is one
 MOVING = 0.05  # motion at a record's start, next to that of all of it, that is said
 REVERSED = -0.5  # correlation of a response with what was measured below which a sign is wrong
@@ -28,75 +43,63 @@ class Diagnosis(NamedTuple):
     Attributes:
         nominal: the model, without effects that it may have.
         records: what was measured.
-        verdict: "none", where the records agree with the model within noise and its tolerance; "effect", where other
-            values of its own elements explain them; "unknown", where a law that it lacks acts.
-        examination: gap, tests, places and the force there.
+        examination: gap, tests, places and the force there, of the samples that are not held out.
+        causes: what explains the gap; None where there is none.
+        verdict: "none", where the records agree with the model within noise and its tolerance; "effect", where the
+            selected effects explain them; "ambiguous", where others do as well; "unknown", where none does.
+        judgement: the verdict with its probability and what is not told apart.
         warnings: what is to be known before these numbers are used.
     """
 
     nominal: LumpedModel
     records: tuple[Record, ...]
-    verdict: str
     examination: Examination
+    causes: Causes | None
+    judgement: Verdict
     warnings: tuple[str, ...]
+
+    @property
+    def verdict(self) -> str:
+        return self.judgement.name
+
+    @property
+    def model(self) -> LumpedModel:
+        """The improved model: with the selected effects and refitted numbers."""
+        nothing = self.causes is None or self.verdict == "none"
+        return self.examination.refit if nothing or self.causes is None else self.causes.chosen.model
+
+    @property
+    def closure(self) -> Closure | None:
+        """How far the gap shrinks on held-out samples."""
+        return None if self.causes is None else self.causes.closures[-1]
 
     @property
     def summary(self) -> tuple[str, str]:
         """The verdict and what it means, a sentence each."""
-        if self.examination.finding == "structure":
-            return (
-                "The model lacks something.",
-                "No numbers of its masses, springs and dampers explain these records.",
-            )
-        refitted = "refitted within its own structure the model leaves noise alone."
-        if self.examination.finding == "parameters":
-            return (
-                "The model's structure is right, its numbers are not.",
-                f"{refitted[0].upper()}{refitted[1:]}",
-            )
-        told = "The records agree with the model, within its tolerance and the noise."
-        if self.examination.before.total > APART:
-            return told, f"Its numbers are off by no more than they may be; {refitted}"
-        return told, "Nothing that the model lacks is to be seen in these records."
+        return summary(self)
 
     @property
     def remaining(self) -> str:
-        """What is left once the model's own numbers are right, in words."""
-        gap = self.examination.recalibrated
-        if self.verdict == "unknown":
-            return (
-                f"The best linear model of this structure leaves {gap.total:.3g} times the noise: a law that it does "
-                "not have acts."
-            )
-        return f"The linear model, its numbers refitted, leaves {gap.total:.3g} times the noise."
+        """What is left once the selected effects are added, in words."""
+        return remaining(self)
 
     @property
     def next_experiment(self) -> str:
         """What to measure next, in words."""
-        found = self.examination.locations
-        if found is None:
-            told = all(n.degrees > 0 for n in self.examination.noises)
-            return (
-                ""
-                if told
-                else "A record with repeated periods, or a quiet start, would tell the noise apart."
-            )
-        if any(place.where == "input" for place in found.likely):
-            names = ", ".join(place.ends[0] for place in found.likely if place.where == "input")
-            return f"What enters as {names} by a sensor of its own: it tells an error of the input from a force there."
-        if len(found.likely) > 1:
-            ends = ", ".join(place.label for place in found.likely)
-            return f"One more sensor, on a body that {ends} move differently."
-        return "The same input at a third and at three times its level: how the force grows with it tells the law."
+        return next_experiment(self)
 
     def as_dict(self) -> dict[str, Any]:
         """What diagnosis.json holds."""
         return {
             "name": self.nominal.name,
             "verdict": self.verdict,
+            "verdict_probability": self.judgement.probability,
             "finding": self.examination.finding,
             **self.examination.as_dict(),
-            "selected": self._selected(),
+            "effects": self.effects(),
+            "selected": self.selected(),
+            **self._others(),
+            "closure": None if self.closure is None else self.closure.as_dict(),
             "elements": self._elements(),
             "forces": [
                 {
@@ -124,40 +127,98 @@ class Diagnosis(NamedTuple):
             for x, value, std, nominal in zip(values.listed, *columns, strict=True)
         ]
 
-    def _selected(self) -> list[dict[str, Any]]:
-        """Errors of the model's own numbers, where these explain the gap: those that stand out."""
-        if self.verdict != "effect":
+    def effects(self) -> list[dict[str, Any]]:
+        """Candidates of the rounds in which an effect was found, most probable first.
+
+        Each with the number of its round, and the rms in noise that its fit leaves.
+        """
+        if self.causes is None:
             return []
-        found = []
-        for element, row in zip(self.examination.elements.listed, self._elements(), strict=True):
-            nominal, std = row["nominal"], row["std"]
-            if nominal == 0 or abs(row["value"] - nominal) < SURE * std:
-                continue
-            place = element_place(self.nominal, element)
-            factor = {"value": row["value"] / nominal, "std": std / abs(nominal), "unit": ""}
-            kind = KINDS[element.quantity]
-            found.append((abs(factor["value"] - 1) / factor["std"], kind, place, factor))
-        gap = self.examination.recalibrated.nrmse
+        count = max(len(self.causes.selected), 1)
+        best: dict[Key, tuple[Explanation, Ranking, int]] = {}
+        for number, ranking in enumerate(self.causes.rounds[:count], start=1):
+            for x in ranking.ranked:
+                if x.key not in best or best[x.key][0].probability < x.probability:
+                    best[x.key] = x, ranking, number
+        order = sorted(best.values(), key=lambda pair: -pair[0].probability)
         return [
-            {"kind": kind, "place": place, "parameters": {"factor": factor}, "gap_after": gap}
-            for _, kind, place, factor in sorted(found, key=lambda x: -x[0])
+            {
+                **as_pair(x),
+                "probability": x.probability,
+                "parameters": self._parameters(x, x.refit),
+                "confusable_with": [
+                    as_pair(y) for y in ranking.ranked if y.key != x.key and alike(x, y, ranking)
+                ],
+                "round": number,
+                "left": float(np.sqrt(x.refit.fit.squares / max(x.refit.fit.equations, 1))),
+            }
+            for x, ranking, number in order
         ]
 
+    def selected(self) -> list[dict[str, Any]]:
+        """The best explanation, one effect after another; empty where nothing was found."""
+        if self.causes is None or self.verdict == "none":
+            return []
+        if not self.causes.selected:
+            return self._wrong_numbers() if self.verdict != "unknown" else []
+        chosen = self.causes.chosen
+        return [
+            {**as_pair(x), "parameters": self._parameters(x, chosen), "gap_after": closure.by_sensor}
+            for x, closure in zip(self.causes.selected, self.causes.closures, strict=True)
+            if self.verdict != "unknown"
+        ]
 
-def element_place(model: LumpedModel, element: Element) -> dict[str, Any]:
-    """Where a number of a model acts, as in diagnosis.json.
+    def _others(self) -> dict[str, Any]:
+        if self.verdict != "ambiguous":
+            return {}
+        return {"ambiguous_with": [as_pair(x) for likely in self.judgement.likely for x in likely[1:]]}
 
-    Args:
-        model: elements, or matrices, whose numbers bear the names of the bodies that they join.
-        element: one of its numbers.
-    """
-    for connection in model.connections:
-        if element.quantity != "mass" and element.element == connection.name:
-            return {"between": list(connection.between)}
-    ends = element.element.split(", ") if model.matrices is not None else [element.element]
-    if len(ends) > 1:
-        return {"between": ends}
-    return {"body": ends[0]} if element.quantity == "mass" else {"between": [GROUND, *ends]}
+    def _parameters(self, x: Explanation, refit: Refit) -> dict[str, Any]:
+        """Values and deviations of one effect of a fit."""
+        where = [key_of(e.kind, dict(e.place)) for e in refit.hypothesis.effects]
+        if x.key not in where:
+            return self._factor(x, refit)
+        row = where.index(x.key)
+        turning = units_of(self.nominal).turning
+        found = {}
+        for p in CATALOGUE[x.kind].parameters:
+            value = np.ravel(np.asarray(refit.hypothesis.effects[row].parameters[p.name], float))
+            unit = " or ".join(dict.fromkeys(p.unit)) if turning is None else p.unit[int(turning)]
+            said = float(value[0]) if value.size == 1 else value.tolist()
+            found[p.name] = {"value": said, "std": refit.deviations[row][p.name], "unit": unit}
+        return found
+
+    def _factor(self, x: Explanation, refit: Refit) -> dict[str, Any]:
+        rows = elements_by_key(self.nominal).get(x.key, ())
+        if not rows:
+            return {}
+        i, theta = rows[0], refit.fit.theta
+        std = float(np.sqrt(max(refit.fit.covariance[i, i], 0.0)))
+        return {"factor": {"value": 1 + float(theta[i]), "std": std, "unit": ""}}
+
+    def _wrong_numbers(self) -> list[dict[str, Any]]:
+        """Errors of the model's own numbers that stand out, where all of them together explain the gap."""
+        assert self.causes is not None
+        assert self.closure is not None
+        fit, listed = self.causes.chosen.fit, element_matrices(self.nominal).listed
+        nominal = np.asarray(element_matrices(self.nominal).nominal)
+        found = []
+        for i, element in enumerate(listed):
+            change, std = float(fit.theta[i]), float(np.sqrt(max(fit.covariance[i, i], 0.0)))
+            if nominal[i] == 0 or abs(change) < SURE * std:
+                continue
+            factor = {"value": 1 + change, "std": std, "unit": ""}
+            place = plain_place(element_place(self.nominal, element))
+            found.append((abs(change) / std, ERRORS[element.quantity], place, factor))
+        return [
+            {
+                "kind": kind,
+                "place": place,
+                "parameters": {"factor": factor},
+                "gap_after": self.closure.by_sensor,
+            }
+            for _, kind, place, factor in sorted(found, key=lambda x: -x[0])
+        ]
 
 
 def diagnose(
@@ -189,9 +250,18 @@ def diagnose(
     """
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
     records = (records,) if isinstance(records, Record) else tuple(records)
-    found = examine(model, records, progress=progress)
-    said = _warnings(model, records, found, initial == "rest")
-    return Diagnosis(model, records, VERDICTS[found.finding], found, said)
+    seen = tuple(seen_part(r) for r in records) if all(_long(r) for r in records) else records
+    found = examine(model, seen, progress=progress)
+    causes = (
+        causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
+    )
+    said = _warnings(model, seen, found, initial == "rest")
+    return Diagnosis(model, records, found, causes, verdict_of(found, causes), said)
+
+
+def _long(record: Record) -> bool:
+    """Whether enough is left of a record when its end is held out."""
+    return held_out_begin(record) >= FEWEST and len(record.y) - held_out_begin(record) >= FEWEST
 
 
 def _warnings(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsid.checks import require
-from jaxsid.gap.locate import Locations, locate
+from jaxsid.gap.locate import Locations, Scored, located, scored
 from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
 from jaxsid.gap.null import Null, null_test, tolerance_test
@@ -52,6 +52,8 @@ class Examination(NamedTuple):
         noises: of each record.
         elements: values of the refitted model, their deviations, and the nominal ones.
         beside: each record with both models' responses.
+        fit: the refitted model beside the records, weighed by these noises.
+        scored: what stands behind the places.
     """
 
     finding: str
@@ -65,6 +67,8 @@ class Examination(NamedTuple):
     noises: tuple[Noise, ...]
     elements: ElementValues
     beside: tuple[Beside, ...]
+    fit: Recalibrated
+    scored: Scored | None
 
     def as_dict(self) -> dict[str, Any]:
         """The parts `gap` and `locations` of diagnosis.json."""
@@ -137,8 +141,10 @@ def examine(
     after = as_given(freely.model, records, noises)
     say("how large it is")
     gaps = gap_of(nothing, records), gap_of(after, records)
-    if structural:
+    of = None
+    if off:
         say("where it arises")
+        of = scored(model, records, noises=noises)
     return Examination(
         finding="structure" if structural else "parameters" if off else "agreement",
         nominal_p_value=nominal,
@@ -147,10 +153,12 @@ def examine(
         before=gaps[0],
         recalibrated=gaps[1],
         refit=freely.model,
-        locations=_located(model, records, nothing, after) if structural else None,
+        locations=_located(of, nothing, after) if structural and of is not None else None,
         noises=noises,
         elements=_values(model, freely),
         beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
+        fit=after,
+        scored=of,
     )
 
 
@@ -176,10 +184,8 @@ def _beside(nominal: Recalibrated, refit: Recalibrated, number: int) -> Beside:
     return Beside(y, *(y - x for x in left))
 
 
-def _located(
-    model: LumpedModel, records: tuple[Record, ...], nothing: Recalibrated, after: Recalibrated
-) -> Locations:
-    found = locate(model, records, noises=nothing.noises)
+def _located(of: Scored, nothing: Recalibrated, after: Recalibrated) -> Locations:
+    found = located(of)
     ratio = math.sqrt(nothing.squares / max(after.squares, 1e-300))
     if ratio < FAR:
         return found

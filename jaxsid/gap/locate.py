@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxsid.checks import require
 from jaxsid.gap.apart import COMPARED, expected_differences, same_force, sets_of
@@ -64,6 +64,26 @@ class Locations(NamedTuple):
     remarks: tuple[str, ...]
 
 
+class Scored(NamedTuple):
+    """Evidence of places before it is weighed.
+
+    Attributes:
+        model: nominal.
+        settings: of each record.
+        noises: of each record.
+        places: that were compared.
+        tolerance: (e,) relative standard deviations of the model's elements.
+        found: evidence, and what each place makes of the records.
+    """
+
+    model: LumpedModel
+    settings: tuple[Setting, ...]
+    noises: tuple[Noise, ...]
+    places: tuple[Place, ...]
+    tolerance: Float[np.ndarray, " e"]
+    found: Scores
+
+
 def locate(
     model: LumpedModel,
     records: Record | Sequence[Record],
@@ -92,6 +112,17 @@ def locate(
 
     Source: M. Alvarez, D. Luengo, N. Lawrence, IEEE Trans. Pattern Analysis 35 (2013), for forces as processes.
     """
+    return located(scored(model, records, noises=noises, places=places))
+
+
+def scored(
+    model: LumpedModel,
+    records: Record | Sequence[Record],
+    *,
+    noises: Sequence[Noise] | None = None,
+    places: Sequence[Place] | None = None,
+) -> Scored:
+    """Evidence of every place, and what each makes of the records; arguments as of `locate`."""
     records = (records,) if isinstance(records, Record) else tuple(records)
     require(len(records) > 0, "give at least one record.")
     compared = places_of(model) if places is None else tuple(places)
@@ -108,16 +139,16 @@ def locate(
         settings.append(setting_of(spectra, deviations(noise, spectra), directions, rate))
     tolerance = np.array([getattr(model.tolerance, x.quantity) for x in element_matrices(model).listed])
     found = scores(model, settings, compared, tolerance)
-    return _concluded(model, settings, noises, compared, found)
+    return Scored(model, tuple(settings), noises, compared, tolerance, found)
 
 
-def _concluded(
-    model: LumpedModel,
-    settings: list[Setting],
-    noises: tuple[Noise, ...],
-    places: tuple[Place, ...],
-    found: Scores,
-) -> Locations:
+def located(of: Scored) -> Locations:
+    """What the evidence of places says.
+
+    Args:
+        of: from `scored`.
+    """
+    model, settings, noises, places, found = of.model, of.settings, of.noises, of.places, of.found
     value = _with_ties(found, places)
     order = [int(i) for i in np.argsort(-value, kind="stable")]
     same, alike = same_force(model, places), _alike(settings, found, value, order)

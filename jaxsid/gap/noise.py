@@ -14,6 +14,7 @@ from jaxsid.checks import require
 from jaxsid.gap.spectra import Spectra, spectra_of
 from jaxsid.impulse.whitening import MOST, whitening_filter
 from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.mechanics.simulate import measured_sensors
 from jaxsid.records import Record
 
 SAME_INPUT = 0.02  # rms of a difference between two inputs, next to theirs, that are one
@@ -21,6 +22,7 @@ SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, t
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
+FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
 
 
@@ -67,7 +69,17 @@ def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]
         InputError: an input or all sensors of a record are missing.
     """
     require(len(records) > 0, "give at least one record.")
-    return tuple(_of_record(model, r, [x for x in records if x is not r]) for r in records)
+    return tuple(
+        _at_least(_of_record(model, r, [x for x in records if x is not r]), model, r) for r in records
+    )
+
+
+def _at_least(noise: Noise, model: LumpedModel, record: Record) -> Noise:
+    """The same where there is noise at all; records that were computed may have none."""
+    rows, columns = measured_sensors(model, record)
+    rms = np.zeros(len(model.sensors))
+    rms[rows] = np.sqrt((np.asarray(record.y)[:, columns] ** 2).mean(axis=0))
+    return eqx.tree_at(lambda n: n.level, noise, np.fmax(noise.level, FINEST * rms) + 0 * noise.level)
 
 
 def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Noise:
@@ -178,19 +190,21 @@ def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str)
     for j in range(outputs):
         if not np.isfinite(signals[:, :, j]).all():
             continue
-        taps[j] = whitening_filter(signals[:, :, j])
-        white = sum(c * np.roll(signals[:, :, j], k, axis=1) for k, c in enumerate(taps[j]))
+        # an offset is no noise: a filter that took it for some would hide it
+        own = signals[:, :, j] - signals[:, :, j].mean()
+        taps[j] = whitening_filter(own)
+        white = sum(c * np.roll(own, k, axis=1) for k, c in enumerate(taps[j]))
         level[j] = np.sqrt((np.asarray(white)[:, MOST:] ** 2).mean())
     return Noise(level, taps, float(signals[:, :, 0].size), source)
 
 
-def residual_noise(signals: Float[np.ndarray, "samples outputs"]) -> Noise:
+def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> Noise:
     """Level and colour of what a model left, taken for noise as a whole.
 
     Args:
-        signals: what it left; NaN for absent sensors.
+        signals: what it left, in one piece or several of equal length; NaN for absent sensors.
     """
-    noise = _fitted(signals[None], SOURCES[3])
+    noise = _fitted(signals if signals.ndim == 3 else signals[None], SOURCES[3])
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 

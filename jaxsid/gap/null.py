@@ -120,7 +120,7 @@ def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit
     ratio = (explained / rank) / (max(total - explained, 1e-300) / rest)
     p = float(betainc(rest / 2, rank / 2, rest / (rest + rank * ratio)))
     excess = max(explained - (total - explained) * rank / rest, 0.0) / total
-    return Test(name, p, np.sqrt(excess) * _left_share(fit))
+    return Test(name, p, np.sqrt(excess) * left_share(fit))
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:
@@ -130,8 +130,12 @@ def _leveled(setting: Setting, linear: Linear) -> Setting:
     return eqx.tree_at(lambda s: s.scale, setting, setting.scale / level)
 
 
-def _left_share(fit: Recalibrated) -> float:
-    """Rms of what is left next to that of the response, the mean over all sensors."""
+def left_share(fit: Recalibrated) -> float:
+    """Rms of what is left next to that of the response, the mean over all sensors.
+
+    Args:
+        fit: the model and what it leaves.
+    """
     left = sum((np.abs(np.asarray(x.left)) ** 2).sum(axis=0) for x in fit.linear)
     size = sum((np.abs(np.asarray(s.spectra.y)) ** 2).sum(axis=0) for s in fit.settings)
     present = np.asarray(size) > 0
@@ -151,7 +155,7 @@ def _lone_line(fit: Recalibrated) -> Test:
     power, others, count = np.concatenate(every, axis=1)
     alone = (1 + power / np.maximum(others, np.finfo(float).tiny)) ** -count
     p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
-    share = np.sqrt(power[alone.argmin()] / power.sum()) * _left_share(fit)
+    share = np.sqrt(power[alone.argmin()] / power.sum()) * left_share(fit)
     return Test("lone frequency", p, float(share))
 
 
@@ -162,5 +166,5 @@ def _power(fit: Recalibrated) -> Test:
     equations = max(fit.equations - nuisances, 1)
     ratio = fit.squares / equations
     p = float(betainc(degrees / 2, equations / 2, degrees / (degrees + equations * ratio)))
-    share = np.sqrt(max(1 - 1 / max(ratio, 1e-300), 0.0)) * _left_share(fit)
+    share = np.sqrt(max(1 - 1 / max(ratio, 1e-300), 0.0)) * left_share(fit)
     return Test("power beyond the noise", p, share)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
 from jaxsid.gap.evidence import table
-from jaxsid.gap.noise import Noise, deviations, residual_noise
+from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import Motion, in_time, motion_under, parameter_columns, spectra_of
 from jaxsid.mechanics.lumped import LumpedModel
@@ -119,7 +119,8 @@ def as_given(model: LumpedModel, records: Sequence[Record], noises: Sequence[Noi
         noises: one a record.
     """
     count = len(element_matrices(model).listed)
-    return _evaluated(model, records, tuple(noises), np.zeros(count), np.full(count, FIXED))
+    levels = [_levels(noise, record) for noise, record in zip(noises, records, strict=True)]
+    return _evaluated(model, records, tuple(noises), np.zeros(count), np.full(count, FIXED), levels)
 
 
 def _signals(setting: Setting, linear: Linear) -> np.ndarray:
@@ -134,7 +135,8 @@ def _fit(
     change: np.ndarray,
     prior: np.ndarray,
 ) -> Recalibrated:
-    best = _evaluated(model, records, noises, change, prior)
+    levels = [_levels(noise, record) for noise, record in zip(noises, records, strict=True)]
+    best = _evaluated(model, records, noises, change, prior, levels)
     damping = 1e-3
     for _ in range(STEPS):
         gram = np.sum([np.asarray(x.gram) for x in best.linear], axis=0)
@@ -144,7 +146,7 @@ def _fit(
         step = np.linalg.solve(own + damping * np.diag(np.diag(own)), downhill)
         step = step / max(1.0, np.abs(step).max() / LARGEST)
         candidate = np.maximum(best.change + step, -0.95)
-        found = _evaluated(model, records, noises, candidate, prior)
+        found = _evaluated(model, records, noises, candidate, prior, levels)
         gain = _cost(best, prior) - _cost(found, prior)
         if gain > 0:
             best, damping = found, damping / 10
@@ -166,6 +168,7 @@ def _evaluated(
     noises: tuple[Noise, ...],
     change: np.ndarray,
     prior: np.ndarray,
+    levels: Sequence[np.ndarray],
 ) -> Recalibrated:
     elements = element_matrices(model)
     values = np.asarray(elements.nominal)
@@ -174,9 +177,9 @@ def _evaluated(
     directions = element_directions(model)
     rate = slowest_rate(moved)
     settings, linear = [], []
-    for record, noise in zip(records, noises, strict=True):
+    for record, level in zip(records, levels, strict=True):
         spectra = spectra_of(moved, record)
-        settings.append(setting_of(spectra, deviations(noise, spectra), directions, rate))
+        settings.append(setting_of(spectra, level, directions, rate))
         linear.append(beside(settings[-1]))
     gram = np.sum([np.asarray(x.gram) for x in linear], axis=0)
     covariance = np.linalg.inv(gram[:-1, :-1] + np.diag(prior**-2))
@@ -192,6 +195,12 @@ def _evaluated(
         float(gram[-1, -1]),
         equations,
     )
+
+
+def _levels(noise: Noise, record: Record) -> np.ndarray:
+    """Standard deviations of a record's lines."""
+    dt = float(record.dt)
+    return noise.deviation(2 * np.pi * np.fft.rfftfreq(len(record.y), dt), dt)
 
 
 def _weights(setting: Setting) -> Array:

@@ -6,6 +6,15 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.examine import NEGLIGIBLE, SIGNIFICANT
 from jaxsid.gap.locate import Location
 from jaxsid.gap.null import Test
+from jaxsid.report.causes_page import (
+    before_after_section,
+    closure_cards,
+    closure_section,
+    next_section,
+    numbers_section,
+    remaining_section,
+    which_section,
+)
 from jaxsid.report.evidence import software
 from jaxsid.report.frame import (
     Block,
@@ -25,11 +34,13 @@ from jaxsid.report.frame import (
 from jaxsid.report.numbers import (
     MISSING,
     TIMES,
+    chance,
     change,
     minus,
     misfit,
     percent,
     plural,
+    share_of,
     significant,
     with_std,
 )
@@ -52,6 +63,15 @@ REFERENCES = (
         "M. Alvarez, D. Luengo and N. Lawrence, Linear latent force models using Gaussian processes, IEEE Trans. "
         "Pattern Analysis and Machine Intelligence 35 (2013)",
         "https://doi.org/10.1109/TPAMI.2013.86",
+    ),
+    Link(
+        "R. Kass and A. Raftery, Bayes factors, J. American Statistical Association 90 (1995), for evidence by the "
+        "method of Laplace",
+        "https://doi.org/10.1080/01621459.1995.10476572",
+    ),
+    Link(
+        "H. Künsch, The jackknife and the bootstrap for general stationary observations, Ann. Statist. 17 (1989)",
+        "https://doi.org/10.1214/aos/1176347265",
     ),
     Link(
         "Y. Benjamini and Y. Hochberg, Controlling the false discovery rate, J. R. Statist. Soc. B 57 (1995)"
@@ -78,24 +98,38 @@ def diagnosis_page(found: Diagnosis) -> str:
 
 def diagnosis_sections(found: Diagnosis) -> tuple[Section, ...]:
     """All sections, for a report that holds more than this."""
+    explained = found.causes is not None
     return (
         _findings(found),
         _gap(found),
         _where(found),
+        which_section(found),
         _force(found),
-        _numbers(found),
-        _in_time(found),
+        before_after_section(found) if explained else _in_time(found),
+        closure_section(found),
+        remaining_section(found),
+        next_section(found),
+        numbers_section(found) if explained else _numbers(found),
         _method(found),
     )
 
 
 def _findings(found: Diagnosis) -> Section:
-    seen = found.examination
     tone = "good" if found.verdict == "none" else "warning"
     sentence, meaning = found.summary
+    cards = _gap_cards(found) if found.causes is None else closure_cards(found)
+    blocks: list[Block] = [Notice(sentence, (meaning, found.remaining), tone), Cards(cards)]
+    if found.warnings:
+        blocks.append(Notice(plural(len(found.warnings), "remark"), found.warnings))
+    return Section("Findings", tuple(blocks))
+
+
+def _gap_cards(found: Diagnosis) -> tuple[Card, ...]:
+    """Of records that the model agrees with."""
+    seen = found.examination
     worst = max(seen.before.nrmse, key=lambda name: np.nan_to_num(seen.before.nrmse[name]))
     floor = seen.before.noise_floor[worst]
-    cards = [
+    return (
         Card(
             "Gap",
             f"{significant(seen.before.total, 3)}{TIMES}noise",
@@ -111,32 +145,12 @@ def _findings(found: Diagnosis) -> Section:
             f"{significant(seen.recalibrated.total, 3)}{TIMES}noise",
             f"{worst}: {misfit(seen.recalibrated.nrmse[worst])}",
         ),
-    ]
-    if seen.locations is not None:
-        first = seen.locations.ranked[0]
-        share = sum(x.probability for x in seen.locations.ranked if x.place in seen.locations.likely)
-        others = len(seen.locations.likely) - 1
-        remark = f"probability {share_of(share)}" + (
-            f", with {plural(others, 'other')} not told apart" if others else ""
-        )
-        cards.append(Card("Where", label_of(first.place), remark))
-    blocks: list[Block] = [Notice(sentence, (meaning, found.remaining), tone), Cards(tuple(cards))]
-    if found.warnings:
-        blocks.append(Notice(plural(len(found.warnings), "remark"), found.warnings))
-    if found.next_experiment:
-        blocks.append(Text(f"To measure next: {found.next_experiment[0].lower()}{found.next_experiment[1:]}"))
-    return Section("Findings", tuple(blocks))
-
-
-def share_of(probability: float) -> str:
-    """A probability in percent, without digits that it does not have.
-
-    Args:
-        probability: from 0 to 1.
-    """
-    if probability > 0.99:
-        return "above 99 %"
-    return percent(probability) if probability >= 0.001 else "below 0.1 %"
+        Card(
+            "Probability of no effect",
+            share_of(found.judgement.probability["none"]),
+            "that the model lacks nothing",
+        ),
+    )
 
 
 def _gap(found: Diagnosis) -> Section:
@@ -234,7 +248,8 @@ MEANING = (
     "gap or a stop, a loop hysteresis."
 )
 MAP = minus(
-    "Grey: samples; blue: their mean. F acts as -F on the second end and as +F on the first: springs rise to the right."
+    "Grey: samples; blue: their mean; orange: the law that was chosen, along the same motion, dashed where the other "
+    "signal matters too. F acts as -F on the second end and as +F on the first: springs rise to the right."
 )
 
 
@@ -280,7 +295,7 @@ def _method(found: Diagnosis) -> Section:
     note = (
         f"Nothing is claimed unless chance would give it less than once in {1 / SIGNIFICANT:.0f} right models and it "
         f"is above {percent(NEGLIGIBLE)} of the response. Nominal model within its tolerance: probability "
-        f"{_p(seen.nominal_p_value)}; any numbers of its elements: {_p(seen.structural_p_value)}."
+        f"{chance(seen.nominal_p_value)}; any numbers of its elements: {chance(seen.structural_p_value)}."
     )
     table = Table(
         ("Test of what the refitted model leaves", "By chance", "Share"),
@@ -292,8 +307,4 @@ def _method(found: Diagnosis) -> Section:
 
 
 def _test(x: Test) -> tuple[str, str, str]:
-    return x.name, _p(x.p_value), percent(x.share)
-
-
-def _p(value: float) -> str:
-    return "below 10⁻¹⁰" if value < 1e-10 else significant(value, 2)
+    return x.name, chance(x.p_value), percent(x.share)

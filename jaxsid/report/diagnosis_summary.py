@@ -5,31 +5,50 @@ from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 
-from jaxsid.gap.diagnose import APART, Diagnosis
+from jaxsid.gap.diagnose import Diagnosis
+from jaxsid.gap.explain import key_of
 from jaxsid.gap.locate import Locations
-from jaxsid.report.diagnosis_page import share_of
-from jaxsid.report.numbers import change, misfit, percent, significant, with_std
+from jaxsid.gap.words import APART, kind_words, place_words
+from jaxsid.report.causes_page import parameters_said
+from jaxsid.report.numbers import change, misfit, percent, share_of, significant, with_std
 from jaxsid.report.plots.places import label_of
 from jaxsid.report.summary import table
 
-PLACES = 6
+PLACES, EFFECTS = 4, 5
+POSSIBLE = 0.01  # probability from which on parameters are shown
 
 
 def print_diagnosis(found: Diagnosis, console: Console | None = None) -> None:
-    """Verdict, gap, places and remarks as rich tables, on standard output unless a console is given."""
+    """Verdict, closure, effects, what remains and what to measure, on standard output unless a console is given."""
     console = Console() if console is None else console
     sentence, meaning = found.summary
-    console.print(f"\n[bold]{escape(found.nominal.name)}[/]: {sentence} {meaning}")
+    console.print(f"\n[bold]{escape(found.nominal.name)}[/]: {escape(sentence)}")
+    console.print(escape(meaning))
     console.print(_gap(found))
     if found.examination.locations is not None:
         console.print(_places(found.examination.locations))
+    if found.causes is not None:
+        console.print(_effects(found))
     elif found.examination.before.total > APART:
         console.print(_numbers(found))
+    console.print(escape(found.remaining))
     if found.next_experiment:
-        console.print(f"To measure next: {found.next_experiment}")
+        console.print(f"To measure next: {escape(found.next_experiment)}")
     if found.warnings:
         text = "\n".join(f"• {escape(warning)}" for warning in found.warnings)
         console.print(Panel(text, title="Remarks", border_style="yellow", title_align="left"))
+
+
+def _effects(found: Diagnosis):
+    """The most probable of those that were tried; a dot marks what the improved model has."""
+    made = table("Which effect", "effect", "probability", "parameters", "left (noise = 1)")
+    chosen = {key_of(x["kind"], x["place"]) for x in found.selected()}
+    for x in found.effects()[:EFFECTS]:
+        mark = "● " if key_of(x["kind"], x["place"]) in chosen else ""
+        said = f"{mark}{kind_words(x['kind'])} {place_words(x['place'])}"
+        parameters = parameters_said(x["parameters"]) if x["probability"] >= POSSIBLE else ""
+        made.add_row(escape(said), share_of(x["probability"]), escape(parameters), significant(x["left"], 3))
+    return made
 
 
 def _gap(found: Diagnosis):

@@ -9,12 +9,13 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.identification import Identification
 
 
-def write_report(found: Identification, path: Path | str) -> None:
+def write_report(found: Identification, path: Path | str, *, later: str | None = None) -> None:
     """Write report.html: findings first, then the evidence; the file is there whole or not at all.
 
     Args:
         found: what was identified.
         path: file to write.
+        later: address of the report of a diagnosis with this model, to be pointed to.
 
     Raises:
         InputError: the folder is missing or cannot be written to; matplotlib or jinja2 is not installed.
@@ -22,7 +23,7 @@ def write_report(found: Identification, path: Path | str) -> None:
     check_installed("matplotlib", "jinja2")
     from jaxsid.report.identification_page import report_page  # slow to load
 
-    text = report_page(found)
+    text = report_page(found, later)
     write_atomically(path, lambda stream: stream.write(text))
 
 

@@ -1,6 +1,7 @@
 """The page about an identification: findings first, then the evidence."""
 
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import units_of
 from jaxsid.report.evidence import (
     cbsi_section,
     frequency_section,
@@ -14,19 +15,23 @@ from jaxsid.report.evidence import (
     time_section,
 )
 from jaxsid.report.findings import fit_section, key_findings, matrices_section
-from jaxsid.report.frame import Gallery, Section, page
+from jaxsid.report.frame import Gallery, Link, Links, Section, Text, page
 from jaxsid.report.numbers import plural, significant
 from jaxsid.report.parameters import parameters_section
 from jaxsid.report.residuals import residual_section
-from jaxsid.report.units import units_of
 
 
-def report_page(found: Identification) -> str:
-    """The report as HTML."""
+def report_page(found: Identification, later: str | None = None) -> str:
+    """The report as HTML.
+
+    Args:
+        found: what was identified.
+        later: address of the report of a diagnosis with this model, to be pointed to.
+    """
+    first, *others = report_sections(found)
+    sections = (first, *([] if later is None else [_later(later)]), *others)
     title = f"Identification: {found.nominal.name}"
-    return page(
-        title, _subtitle(found), report_sections(found), f"Made with {software()}. All values in SI units."
-    )
+    return page(title, _subtitle(found), sections, f"Made with {software()}. All values in SI units.")
 
 
 def report_sections(found: Identification) -> tuple[Section, ...]:
@@ -49,6 +54,11 @@ def report_sections(found: Identification) -> tuple[Section, ...]:
         records_section(found),
         method_section(found),
     )
+
+
+def _later(address: str) -> Section:
+    told = "The model found here was then held against a later record of the same machine, to see what has changed."
+    return Section("What came later", (Text(told), Links((Link("Diagnosis of the later record", address),))))
 
 
 def _subtitle(found: Identification) -> str:

@@ -71,3 +71,23 @@ def misfit(nrmse: float) -> str:
 
 def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def share_of(probability: float) -> str:
+    """A probability in percent, without digits that it does not have.
+
+    Args:
+        probability: from 0 to 1.
+    """
+    if probability > 0.99:
+        return "above 99 %"
+    return percent(probability) if probability >= 0.001 else "below 0.1 %"
+
+
+def chance(p_value: float) -> str:
+    """The probability of something by chance.
+
+    Args:
+        p_value: from 0 to 1.
+    """
+    return "below 10⁻¹⁰" if p_value < 1e-10 else significant(p_value, 2)

@@ -6,11 +6,11 @@ import numpy as np
 
 from jaxsid.files.results_json import SCHEMA, plain
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import sensor_kinds
 from jaxsid.physical.elements import ElementValues
 from jaxsid.pipeline.misses import Peaks, cross_peaks, own_peaks
 from jaxsid.records import SecondOrderModel
 from jaxsid.report.modes import displacement_shapes, modes_of
-from jaxsid.report.units import sensor_kinds
 
 MATRICES = ("mass", "damping", "stiffness")
 

@@ -19,4 +19,5 @@ EFFECT = Kind(
     about="Gears, couplings and worn joints move freely within a gap before their spring takes hold.",
     source="M. Nordin and P.-O. Gutman, Automatica 38 (2002).",
     force=_force,
+    needs="joined",
 )

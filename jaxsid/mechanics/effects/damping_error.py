@@ -21,4 +21,5 @@ EFFECT = Kind(
     about="Damping differs from the nominal one, which is seldom known better than by a factor of two.",
     source="M. Friswell and J. Mottershead, Finite Element Model Updating in Structural Dynamics, 1995.",
     changes=_changes,
+    needs="joined",
 )

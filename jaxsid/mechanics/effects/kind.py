@@ -116,6 +116,8 @@ class Kind(NamedTuple):
         rate: derivative of the memory in time, from a `Motion`.
         slip: magnitude of dry friction, F = slip sign(v), from the speed; at rest it balances up to slip(0).
         states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
+        sensible: whether parameters, in their order, are such as the law is meant for; least values apart.
+        needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
     """
 
     name: str
@@ -129,6 +131,8 @@ class Kind(NamedTuple):
     rate: Callable[..., Any] | None = None
     slip: Callable[..., Any] | None = None
     states: int = 0
+    sensible: Callable[..., bool] | None = None
+    needs: Literal["", "joined", "apart"] = ""
 
 
 def power(x: Array, exponent: Array) -> Array:

@@ -23,4 +23,5 @@ EFFECT = Kind(
     about="Two bodies, or a body and the ground, touch where the model has nothing: a cable, a hose, a guide.",
     source="M. Friswell and J. Mottershead, Finite Element Model Updating in Structural Dynamics, 1995.",
     changes=_changes,
+    needs="apart",
 )

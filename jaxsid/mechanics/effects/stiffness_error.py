@@ -21,4 +21,5 @@ EFFECT = Kind(
     about="Springs are softer or stiffer than the nominal ones: wear, a loose joint, a wrong dimension.",
     source="M. Friswell and J. Mottershead, Finite Element Model Updating in Structural Dynamics, 1995.",
     changes=_changes,
+    needs="joined",
 )

@@ -11,6 +11,10 @@ def _slip(speed: Array, force: Array, static_force: Array, velocity: Array) -> A
     return force + (static_force - force) * jnp.exp(-((speed / velocity) ** 2))
 
 
+def _sensible(force: float, static_force: float, velocity: float) -> bool:
+    return static_force >= force
+
+
 EFFECT = Kind(
     name="stribeck_friction",
     where="between",
@@ -23,4 +27,5 @@ EFFECT = Kind(
     about="Lubricated contacts break loose at a static level and slide at a lower one, so that slow motion jerks.",
     source="B. Armstrong-Helouvry, P. Dupont and C. Canudas de Wit, Automatica 30 (1994).",
     slip=_slip,
+    sensible=_sensible,
 )

@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsid.identification import FrequencyFit, Identification
+from jaxsid.mechanics.units import sensor_kinds, units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.style import (
     BLUE,
@@ -19,7 +20,6 @@ from jaxsid.report.style import (
     log_scale,
     new_figure,
 )
-from jaxsid.report.units import sensor_kinds, units_of
 
 
 def frequency_figure(found: Identification, output: str, column: int = 0, record: int = 0) -> Figure:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 
 from jaxsid.gap.diagnose import Diagnosis
+from jaxsid.mechanics.units import units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.numbers import DASH
 from jaxsid.report.plots.time import close_look
@@ -29,7 +30,6 @@ from jaxsid.report.style import (
     shortened,
     title,
 )
-from jaxsid.report.units import units_of
 
 COLOURS = (BLUE, GREEN, PINK, INK)  # of as many sensors; more are left out
 CLOSE = 300  # samples of a close look

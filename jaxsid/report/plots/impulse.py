@@ -5,9 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import sensor_kinds, units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.style import BLUE, MUTED, label, legend, new_figure, scaled, title
-from jaxsid.report.units import sensor_kinds, units_of
 
 ROWS = 4  # outputs a figure shows
 DECAYED = 0.02  # of the largest value; what follows is not shown

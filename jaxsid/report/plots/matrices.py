@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from jaxsid.checks import require
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
+from jaxsid.mechanics.units import units_of
 from jaxsid.report.numbers import significant
 from jaxsid.report.style import BLUE, INK, ORANGE, label, new_figure, title
-from jaxsid.report.units import units_of
 
 ANNOTATED = 6  # larger matrices are coloured only
 SIGNED = LinearSegmentedColormap.from_list("signed", [ORANGE, "#f7f7f7", BLUE])

@@ -11,11 +11,24 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.gap.locate import Locations
 from jaxsid.gap.places import Place
+from jaxsid.mechanics.units import Units, units_of
 from jaxsid.report.envelope import envelope
+from jaxsid.report.law import law_along
 from jaxsid.report.numbers import DASH
 from jaxsid.report.plots.time import close_look
-from jaxsid.report.style import BLUE, FONT, INK, MUTED, ORANGE, label, new_figure, scaled, shortened, title
-from jaxsid.report.units import Units, units_of
+from jaxsid.report.style import (
+    BLUE,
+    FONT,
+    INK,
+    MUTED,
+    ORANGE,
+    label,
+    legend,
+    new_figure,
+    scaled,
+    shortened,
+    title,
+)
 
 SHOWN = 10  # places
 LINE = 0.2  # inches of height for one
@@ -23,6 +36,9 @@ DOTS = 900  # of a map
 BINS = 24  # along which the mean is drawn
 FEWEST = 8  # samples of one
 CLOSE = 400  # samples of a close look
+SCATTER = (
+    0.2  # step from one sample to its neighbour, next to the deviation of all, from which on it is no curve
+)
 
 
 def place_figure(found: Locations) -> Figure:
@@ -57,7 +73,7 @@ def _percent(share: float) -> str:
 
 
 def map_figure(found: Diagnosis, force: ForceMap) -> Figure:
-    """The force of a place against displacement and velocity there: dots are samples, the line their mean."""
+    """The force of a place against displacement and velocity there: samples, their mean, and the chosen law."""
     units = units_of(found.nominal)
     figure, axes = new_figure(
         f"Force at {shortened(label_of(force.place), 30)}",
@@ -66,8 +82,9 @@ def map_figure(found: Diagnosis, force: ForceMap) -> Figure:
         beside=0.34,
         left=0.74,
         bottom=0.64,
+        top=0.72,
     )
-    law = _law(force)
+    law, fitted = _law(force), law_along(found, force)
     top = 1.1 * float(np.abs(law).max(initial=0.0)) or 1.0
     for ax, signal, of in zip(
         axes[0], (force.displacement, force.velocity), ("displacement", "velocity"), strict=True
@@ -75,10 +92,13 @@ def map_figure(found: Diagnosis, force: ForceMap) -> Figure:
         step = max(len(signal) // DOTS, 1)
         ax.plot(signal[::step], law[::step], ".", color=MUTED, markersize=1.6, alpha=0.6)
         _mean(ax, signal, law)
+        if fitted is not None:
+            _fitted(ax, signal, fitted)
         ax.set_ylim(-top, top)
         scaled(ax, "x", f"{units.name(of)}\n({units.symbol(of)})", float(np.abs(signal).max(initial=0.0)))
     scaled(axes[0, 0], "y", _force_label(units, force), top)
     axes[0, 1].tick_params(labelleft=False)
+    legend(axes[0, 1], 2)
     return figure
 
 
@@ -88,13 +108,26 @@ def _law(force: ForceMap) -> np.ndarray:
 
 
 def _mean(ax: Axes, signal: np.ndarray, force: np.ndarray) -> None:
+    ax.plot(*_binned(signal, force, BINS), color=BLUE, linewidth=1.6, label="mean")
+
+
+def _binned(signal: np.ndarray, force: np.ndarray, bins: int) -> tuple[list[float], list[float]]:
     """Mean of the force in bins of equal width."""
-    edges = np.linspace(signal.min(), signal.max(), BINS + 1)
-    at = np.clip(np.digitize(signal, edges) - 1, 0, BINS - 1)
-    kept = [i for i in range(BINS) if (at == i).sum() >= FEWEST]
-    centre = [float(signal[at == i].mean()) for i in kept]
-    mean = [float(force[at == i].mean()) for i in kept]
-    ax.plot(centre, mean, color=BLUE, linewidth=1.6)
+    edges = np.linspace(signal.min(), signal.max(), bins + 1)
+    at = np.clip(np.digitize(signal, edges) - 1, 0, bins - 1)
+    kept = [i for i in range(bins) if (at == i).sum() >= FEWEST]
+    return [float(signal[at == i].mean()) for i in kept], [float(force[at == i].mean()) for i in kept]
+
+
+def _fitted(ax: Axes, signal: np.ndarray, law: np.ndarray) -> None:
+    """The law as a curve where this signal alone settles it, else its mean, dashed, along the same motion."""
+    order = np.argsort(signal)
+    sorted_law = law[order]
+    look = {"color": ORANGE, "linewidth": 1.6, "label": "law", "zorder": 4}
+    if np.abs(np.diff(sorted_law)).mean() < SCATTER * law.std():
+        ax.plot(*envelope(signal[order], sorted_law), **look)
+    else:
+        ax.plot(*_binned(signal, law, BINS), linestyle=(0, (4, 2)), **look)
 
 
 def _force_label(units: Units, force: ForceMap) -> str:
@@ -111,11 +144,13 @@ def force_figure(found: Diagnosis, force: ForceMap) -> Figure:
     figure, axes = new_figure(
         f"Force at {shortened(where + which, 34)}", 3.3, rows=2, between=0.42, left=0.74
     )
-    law = _law(force)
+    law, fitted = _law(force), law_along(found, force)
     size = float(np.abs(law).max(initial=0.0))
     near = close_look(law, min(CLOSE, len(force.time)))
     for ax, part in ((axes[0, 0], slice(None)), (axes[1, 0], near)):
-        ax.plot(*envelope(force.time[part], law[part]), color=BLUE, linewidth=0.9)
+        ax.plot(*envelope(force.time[part], law[part]), color=BLUE, linewidth=0.9, label="force")
+        if fitted is not None and ax is axes[1, 0]:
+            ax.plot(force.time[part], fitted[part], color=ORANGE, linewidth=1.0, label="law")
         ax.set_xlim(force.time[part][0], force.time[part][-1])
         scaled(ax, "y", _force_label(units, force), size)
     low, high = (law[near] + sign * 2 * force.deviation for sign in (-1, 1))
@@ -124,5 +159,7 @@ def force_figure(found: Diagnosis, force: ForceMap) -> Figure:
         force.time[near][0], force.time[near][-1], color=ORANGE, alpha=0.3, linewidth=1, zorder=0
     )
     title(axes[1, 0], "shaded: two standard deviations")
+    if fitted is not None:
+        legend(axes[1, 0], 2)
     label(axes[1, 0], "time (s)")
     return figure

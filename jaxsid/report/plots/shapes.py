@@ -5,10 +5,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import sensor_kinds
 from jaxsid.report.modes import Mode, displacement_shapes, modes_of
 from jaxsid.report.numbers import significant
 from jaxsid.report.style import BLUE, MUTED, ORANGE, label, new_figure, title
-from jaxsid.report.units import sensor_kinds
 
 NAMED = 12  # sensors beyond this are numbered
 

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsid.identification import Identification
+from jaxsid.mechanics.units import sensor_kinds, units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.style import BLUE, INK, MUTED, ORANGE, label, legend, new_figure, scaled
-from jaxsid.report.units import sensor_kinds, units_of
 
 
 def time_figure(found: Identification, output: str, record: int = 0) -> Figure:

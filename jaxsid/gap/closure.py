@@ -1,0 +1,233 @@
+"""How far the gap shrinks on samples that nothing was chosen or fitted with."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.gap.free_run import Run, free_run
+from jaxsid.gap.noise import Noise
+from jaxsid.gap.refit import FIXED, Bench, Refit
+from jaxsid.gap.shooting import Prior, fitted, products
+from jaxsid.gap.windows import Block, blocks_of
+from jaxsid.mechanics.simulate import ordered_inputs
+from jaxsid.records import Record
+
+HELD_OUT = 0.25  # part of the end of every record that nothing is fitted to
+PIECES = 40  # that what is left is cut into for the interval
+DRAWS = 2000  # of pieces
+ROUNDS = 8  # of the search for initial states
+
+
+class Left(NamedTuple):
+    """What a model leaves of held-out samples.
+
+    Attributes:
+        left: (samples, outputs) of every record, NaN for absent sensors.
+        measured: likewise.
+    """
+
+    left: tuple[Float[np.ndarray, "samples outputs"], ...]
+    measured: tuple[Float[np.ndarray, "samples outputs"], ...]
+
+
+class Closure(NamedTuple):
+    """How far the gap shrinks, all of it on held-out samples.
+
+    Attributes:
+        before, recalibrated, after: NRMSE of the nominal model, of the best linear one, of the chosen one.
+        noise_floor: that of noise alone.
+        fraction: of the nominal model's gap that is gone, 1 - sqrt((a^2 - n^2) / (b^2 - n^2)).
+        ci95: interval of that.
+        against_recalibrated: the fraction of the best linear model's gap.
+        by_sensor: NRMSE of the chosen model.
+    """
+
+    before: float
+    recalibrated: float
+    after: float
+    noise_floor: float
+    fraction: float
+    ci95: tuple[float, float]
+    against_recalibrated: float
+    by_sensor: dict[str, float]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        return {
+            "heldout_before": self.before,
+            "heldout_recalibrated": self.recalibrated,
+            "heldout_after": self.after,
+            "noise_floor": self.noise_floor,
+            "fraction": self.fraction,
+            "ci95": list(self.ci95),
+            "against_recalibrated": self.against_recalibrated,
+            "by_sensor": self.by_sensor,
+        }
+
+
+def held_out_begin(record: Record) -> int:
+    """The first sample of a record that is held out."""
+    return round((1 - HELD_OUT) * len(record.y))
+
+
+def seen_part(record: Record) -> Record:
+    """A record without its held-out end."""
+    end = held_out_begin(record)
+    return Record(
+        record.u[:end],
+        record.y[:end],
+        record.dt,
+        inputs=record.inputs,
+        outputs=record.outputs,
+        hold=record.hold,
+        name=record.name,
+    )
+
+
+def left_of(found: Refit, bench: Bench, records: Sequence[Record], *, windowed: bool) -> Left:
+    """What a fitted model leaves of held-out samples, running on from the last state that was fitted before them.
+
+    Args:
+        found: model.
+        bench: that it was fitted to.
+        records: whole.
+        windowed: whether every window begins anew from the state that suits it, for models that drift away.
+    """
+    begin = [held_out_begin(r) for r in records]
+    blocks = blocks_of(bench.model, records, bench.noises, _length(bench), begin)
+    left, measured = [], []
+    for number, (record, first) in enumerate(zip(records, begin, strict=True)):
+        own = [b for b in blocks if int(b.record[0]) == number]
+        count = len(record.y) - first
+        y = np.concatenate([_judged(b, b.y) for b in own])[:count]
+        seen = np.concatenate([_judged(b, b.weight) for b in own])[:count] > 0
+        run, start = _run_on(found, bench, record, number)
+        if windowed:
+            states = _states(found, bench, own, run.states, start)
+            rest = np.concatenate(
+                [_judged(b, x) for b, x in zip(own, _left(found, bench, own, states), strict=True)]
+            )
+            rest = rest[:count]
+        else:
+            rest = run.outputs[first - start :] - y
+        mask = np.where(seen, 0.0, np.nan)
+        left.append(rest + mask)
+        measured.append(y + mask)
+    return Left(tuple(left), tuple(measured))
+
+
+def _length(bench: Bench) -> int:
+    return bench.blocks[0].y.shape[1] - bench.blocks[0].lead
+
+
+def _judged(block: Block, x: Array | np.ndarray) -> np.ndarray:
+    return np.asarray(x)[:, block.lead :].reshape(-1, x.shape[2])
+
+
+def _run_on(found: Refit, bench: Bench, record: Record, number: int) -> tuple[Run, int]:
+    """The motion from the last window that was fitted to the record's end, and the number of its first sample."""
+    i = max(i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number)
+    block = bench.blocks[i]
+    last = int(np.flatnonzero(np.any(np.asarray(block.weight) > 0, axis=(1, 2)))[-1])
+    u, first = np.asarray(ordered_inputs(bench.model, record)[0]), int(block.first[last])
+    given = {"record": number, "first": first, "substeps": bench.substeps}
+    state = found.fit.states[i][last]
+    return free_run(found.shot, found.fit.theta, u, block.ramps, float(record.dt), state, **given), first
+
+
+def _states(
+    found: Refit, bench: Bench, blocks: Sequence[Block], run: np.ndarray, start: int
+) -> tuple[np.ndarray, ...]:
+    """Initial states of windows, all else as it is."""
+    theta = found.fit.theta
+    size = len(bench.still) // 2
+    hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], found.shot.slots.count)
+    same = np.full(len(theta), FIXED)
+    prior = Prior(
+        same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden])
+    )
+    begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]
+    fit = fitted(found.shot, blocks, prior, theta, begin, substeps=bench.substeps, steps=ROUNDS)
+    return fit.states
+
+
+def _left(
+    found: Refit, bench: Bench, blocks: Sequence[Block], states: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
+    return [
+        np.asarray(products(found.shot, b, theta, jnp.asarray(s), substeps).left)
+        for b, s in zip(blocks, states, strict=True)
+    ]
+
+
+def closure_of(
+    nominal: Left,
+    recalibrated: Left,
+    after: Left,
+    noises: Sequence[Noise],
+    names: Sequence[str],
+    seed: int = 0,
+) -> Closure:
+    """The closure and its interval, by drawing pieces of the held-out samples.
+
+    Args:
+        nominal, recalibrated, after: what the three models leave.
+        noises: of each record.
+        names: of the sensors.
+        seed: of the draws.
+
+    Source: H. Kunsch, Ann. Statist. 17 (1989), for drawing pieces rather than samples.
+    """
+    parts = [_by_piece(x) for x in (nominal, recalibrated, after)]
+    size = _by_piece(Left(nominal.measured, nominal.measured), centred=True)
+    counts = _by_piece(Left(tuple(1.0 + 0 * x for x in nominal.measured), nominal.measured))
+    level = np.concatenate([np.tile(n.rms() ** 2, (PIECES, 1)) for n in noises])
+    floor = np.where(counts > 0, counts * np.nan_to_num(level), 0.0)
+    every = np.arange(len(size))
+
+    def relative(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        whole = size[rows].sum(axis=0)
+        return np.sqrt(x[rows].sum(axis=0) / np.where(whole > 0, whole, np.nan))
+
+    pooled = lambda x, rows: float(np.sqrt(np.nanmean(relative(x, rows) ** 2)))  # noqa: E731
+    b, r, a = (pooled(x, every) for x in parts)
+    n = pooled(floor, every)
+    rng = np.random.default_rng(seed)
+    draws = []
+    for _ in range(DRAWS):
+        rows = rng.integers(0, len(every), len(every))
+        draws.append(fraction(pooled(parts[0], rows), pooled(parts[2], rows), pooled(floor, rows)))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    each = relative(parts[2], every)
+    return Closure(
+        b,
+        r,
+        a,
+        n,
+        fraction(b, a, n),
+        (float(low), float(high)),
+        fraction(r, a, n),
+        dict(zip(names, each.tolist(), strict=True)),
+    )
+
+
+def fraction(before: float, after: float, floor: float) -> float:
+    """Part of a gap that is gone, 1 - sqrt((a^2 - n^2) / (b^2 - n^2)), from 0 to 1; 0 where there was none."""
+    whole = before**2 - floor**2
+    if whole <= 0:
+        return 0.0
+    return float(np.clip(1 - np.sqrt(max(after**2 - floor**2, 0.0) / whole), 0.0, 1.0))
+
+
+def _by_piece(x: Left, *, centred: bool = False) -> np.ndarray:
+    """(records * pieces, outputs) sums of squares."""
+    found = []
+    for left in x.left:
+        mean = np.nansum(left, axis=0) / np.maximum(np.isfinite(left).sum(axis=0), 1)
+        values = left - mean if centred else left
+        found += [np.nansum(part**2, axis=0) for part in np.array_split(values, PIECES)]
+    return np.array(found)

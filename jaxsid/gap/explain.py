@@ -1,0 +1,253 @@
+"""Which effects explain records: candidates from the screening, fitted by simulation, compared by their evidence.
+
+One effect after another: what those found so far do is taken out of the records, what is left is examined and screened
+anew, and the best further candidates are fitted together with them. The evidence of a fit is that of Laplace, tempered,
+since what no candidate has decides more than noise: p_i ~ exp(log Z_i / (s^2 T)), with s^2 the mean square that the
+best one leaves.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, refitted, weighed_anew
+from jaxsid.gap.screen import Candidate
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
+from jaxsid.physical.elements import Element, element_matrices
+
+TEMPERATURE = 20.0
+ROUGH_STEPS, ROUGH_BLOCKS = 8, 1
+SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
+CLOSE = 60.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
+ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
+Key = tuple[str, str, tuple[str, ...]]
+
+
+class Effort(NamedTuple):
+    """How many candidates are fitted roughly, how many thoroughly, and in how many steps at most."""
+
+    tried: int
+    refined: int
+    steps: int
+
+
+FIRST, FURTHER = Effort(10, 4, 25), Effort(8, 2, 12)  # with two effects a step costs several times as much
+
+
+class Explanation(NamedTuple):
+    """One fitted candidate.
+
+    Attributes:
+        kind: of effect.
+        place: as of an `Effect`.
+        refit: fitted, with the effects found before.
+        evidence: its logarithm, in noise, by the equations of all records.
+        probability: of all that were tried.
+    """
+
+    kind: str
+    place: dict[str, Any]
+    refit: Refit
+    evidence: float
+    probability: float
+
+    @property
+    def key(self) -> Key:
+        return key_of(self.kind, self.place)
+
+
+class Ranking(NamedTuple):
+    """All candidates of a round, most probable first, and what the records say without any of them.
+
+    Attributes:
+        ranked: fitted ones.
+        without: the model with what was found before, its numbers within their tolerance.
+        scale: mean square in noise that the best one leaves.
+        bench: that they were fitted to, the noise that of the best one where nothing else tells of it.
+    """
+
+    ranked: tuple[Explanation, ...]
+    without: Refit
+    scale: float
+    bench: Bench
+
+
+def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
+    """Whether records hardly tell two explanations apart.
+
+    Args:
+        x, y: explanations.
+        of: the ranking that they are in.
+    """
+    return abs(x.evidence - y.evidence) / of.scale / TEMPERATURE < SAME
+
+
+def key_of(kind: str, place: Mapping[str, Any]) -> Key:
+    """Kind and place as one value to be compared; the order of two ends does not count."""
+    ((where, ends),) = place.items()
+    named = tuple(sorted(ends)) if where == "between" else (str(ends),)
+    return kind, where, named
+
+
+def element_place(model: LumpedModel, element: Element) -> dict[str, Any]:
+    """Where a number of a model acts, as in diagnosis.json.
+
+    Args:
+        model: elements, or matrices, whose numbers bear the names of the bodies that they join.
+        element: one of its numbers.
+    """
+    for connection in model.connections:
+        if element.quantity != "mass" and element.element == connection.name:
+            return {"between": list(connection.between)}
+    ends = element.element.split(", ") if model.matrices is not None else [element.element]
+    if len(ends) > 1:
+        return {"between": ends}
+    return {"body": ends[0]} if element.quantity == "mass" else {"between": [GROUND, *ends]}
+
+
+def elements_by_key(model: LumpedModel) -> dict[Key, tuple[int, ...]]:
+    """The numbers of a model whose error is a kind of effect; several of connections side by side.
+
+    Args:
+        model: its elements.
+    """
+    found: dict[Key, tuple[int, ...]] = {}
+    for i, element in enumerate(element_matrices(model).listed):
+        key = key_of(ERRORS[element.quantity], element_place(model, element))
+        found[key] = (*found.get(key, ()), i)
+    return found
+
+
+def rank(
+    bench: Bench,
+    candidates: Sequence[Candidate],
+    before: Refit | None,
+    progress: Callable[[str], None] | None = None,
+) -> Ranking:
+    """The most promising candidates fitted, with the effects found before.
+
+    Args:
+        bench: records.
+        candidates: from the screening, most promising first.
+        before: effects found so far.
+        progress: called with a line of text before each fit.
+    """
+    say = progress or (lambda text: None)
+    errors = elements_by_key(bench.model)
+    base = before.hypothesis if before is not None else Hypothesis()
+    part = bench.part(ROUGH_BLOCKS)
+    without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
+    rough = []
+    effort = FIRST if before is None else FURTHER
+    for c in _distinct(candidates, base, errors)[: effort.tried]:
+        say(f"{c.kind} at {_label(c.place)}")
+        hypothesis = extended(base, c, errors)
+        start = _changes(before, bench, c.changes)
+        rough.append((c, refitted(part, hypothesis, changes=start, steps=ROUGH_STEPS)))
+    rough.sort(key=lambda x: -x[1].fit.evidence)
+    ratio = _ratio(bench, part)
+    scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
+    top = rough[0][1].fit.evidence if rough else 0.0
+    if rough and any(n.degrees <= 0 for n in bench.noises):
+        say("level and colour of the noise")
+        best = refitted(
+            bench, rough[0][1].hypothesis, changes=_elements(rough[0][1], bench), steps=effort.steps
+        )
+        bench = weighed_anew(bench, best)
+        without = refitted(bench, base, changes=_elements(without, bench), states=without.fit.states)
+        ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
+    found = []
+    for i, (c, r) in enumerate(rough):
+        near = (top - r.fit.evidence) / scale / TEMPERATURE < CLOSE
+        if i < effort.refined and near:
+            say(f"{c.kind} at {_label(c.place)}, thoroughly")
+            r = refitted(bench, r.hypothesis, changes=_elements(r, bench), steps=effort.steps)
+            found.append((c, r, r.fit.evidence))
+        else:
+            found.append((c, r, math.nan))
+    best = max((e for _, _, e in found if not math.isnan(e)), default=0.0)
+    every = [(c, r, best - ratio * (top - r.fit.evidence) if math.isnan(e) else e) for c, r, e in found]
+    return _ranked(every, without, bench)
+
+
+def _sensible(found: Refit) -> bool:
+    """Whether each law has parameters that it is meant for."""
+    for effect in found.hypothesis.effects:
+        kind = CATALOGUE[effect.kind]
+        values = (float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters)
+        if kind.sensible is not None and not kind.sensible(*values):
+            return False
+    return True
+
+
+def _elements(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
+    return found.fit.theta[: len(bench.tolerance)]
+
+
+def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench) -> Ranking:
+    every = [(c, r, e if _sensible(r) else -math.inf) for c, r, e in every]
+    every = sorted(every, key=lambda x: -x[2])
+    first = every[0][1].fit if every else without.fit
+    scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
+    values = np.array([e for _, _, e in every] + [without.fit.evidence]) / scale / TEMPERATURE
+    weights = np.exp(values - values.max())
+    weights = weights / weights.sum()
+    return Ranking(
+        tuple(
+            Explanation(c.kind, dict(c.place), r, e, float(w))
+            for (c, r, e), w in zip(every, weights[:-1], strict=True)
+        ),
+        without,
+        scale,
+        bench,
+    )
+
+
+def _ratio(whole: Bench, part: Bench) -> float:
+    count = lambda b: sum(float((np.asarray(x.weight) > 0).sum()) for x in b.blocks)  # noqa: E731
+    return count(whole) / max(count(part), 1.0)
+
+
+def _changes(
+    before: Refit | None, bench: Bench, wished: Float[np.ndarray, " e"] | None = None
+) -> Float[np.ndarray, " e"] | None:
+    if before is not None:
+        return before.fit.theta[: len(bench.tolerance)]
+    return None if wished is None else np.asarray(wished)
+
+
+def _distinct(
+    candidates: Sequence[Candidate], base: Hypothesis, errors: Mapping[Key, tuple[int, ...]]
+) -> list[Candidate]:
+    """Candidates that the hypothesis does not have yet."""
+    there = {key_of(e.kind, dict(e.place)) for e in base.effects}
+    there |= {key for key, rows in errors.items() if set(rows) <= set(base.wrong)}
+    found: dict[Key, Candidate] = {}
+    for c in candidates:
+        if (key := key_of(c.kind, c.place)) not in there:
+            found.setdefault(key, c)
+    return list(found.values())
+
+
+def extended(base: Hypothesis, c: Candidate, errors: Mapping[Key, tuple[int, ...]]) -> Hypothesis:
+    """A hypothesis with one candidate more: a wrong number of the model, or an effect.
+
+    Args:
+        base: what there is.
+        c: the candidate.
+        errors: from `elements_by_key`.
+    """
+    rows = errors.get(key_of(c.kind, c.place))
+    if rows is not None:
+        return base._replace(wrong=tuple(sorted({*base.wrong, *rows})))
+    effect = Effect(c.kind, tuple(c.place.items()), dict(c.parameters))
+    return base._replace(effects=(*base.effects, effect))
+
+
+def _label(place: Mapping[str, Any]) -> str:
+    ((_, ends),) = place.items()
+    return " - ".join(ends) if isinstance(ends, tuple | list) else str(ends)

@@ -1,0 +1,210 @@
+"""What a fit holds for possible: effects with their parameters, and how far the model's own numbers may be off.
+
+All unknowns are of order one and have a normal prior: z = (ratio - centre) / spread, or log(ratio / centre) /
+log(spread) of a size, where ratio is a parameter next to its scale at the place; of an element z is the relative
+change.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsid.mechanics.amplitudes import amplitudes
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS, by_sort, kind_number
+from jaxsid.mechanics.effects.prior import Amplitudes, Prior
+from jaxsid.mechanics.lumped import Effect, LumpedModel
+from jaxsid.mechanics.slots import Slots, slots_of
+from jaxsid.records import SecondOrderModel
+
+FLAT = math.pi / math.sqrt(3)  # standard deviation of an angle that may be any
+FIXED = 1e-9  # deviation of what does not vary
+INERT = "sensor_gain"  # a kind that does nothing without a place
+
+
+class Coordinates(eqx.Module):
+    """From unknowns to parameters of effects, each (slots, most).
+
+    Attributes:
+        centre, spread: of the ratio to the scale.
+        logarithmic: whether the unknown is of the ratio's logarithm.
+        scale: of the parameter.
+        raised: number of the parameter that is the power of the scale, -1 for none.
+        lowest: least ratio.
+        deviation: of the unknown's prior; `FIXED` for parameters that the kind does not have.
+        per_record: whether every record has its own.
+    """
+
+    centre: Float[Array, "slots most"]
+    spread: Float[Array, "slots most"]
+    logarithmic: Bool[Array, "slots most"]
+    scale: Float[Array, "slots most"]
+    raised: Int[Array, "slots most"]
+    lowest: Float[Array, "slots most"]
+    deviation: Float[Array, "slots most"]
+    per_record: Bool[Array, "slots most"]
+
+    def parameters(self, z: Float[Array, "slots most"]) -> Float[Array, "slots most"]:
+        """In SI units.
+
+        Args:
+            z: unknowns.
+        """
+        logarithm = jnp.log(jnp.where(self.logarithmic, self.spread, 1.0)) * z
+        ratio = jnp.where(
+            self.logarithmic,
+            self.centre * jnp.exp(jnp.clip(logarithm, -50, 50)),
+            self.centre + self.spread * z,
+        )
+        power = jnp.take_along_axis(ratio, jnp.maximum(self.raised, 0), axis=1)
+        power = jnp.where(self.raised >= 0, power, 1.0)
+        return ratio * jnp.exp(power * jnp.log(self.scale))
+
+    def unknowns(self, parameters: Float[np.ndarray, "slots most"]) -> Float[np.ndarray, "slots most"]:
+        """Of parameters in SI units; undoes `parameters`.
+
+        Args:
+            parameters: in the order of the kind.
+        """
+        given, raised = np.asarray(parameters, float), np.asarray(self.raised)
+        plain = given / np.asarray(self.scale)
+        power = np.take_along_axis(plain, np.maximum(raised, 0), axis=1)
+        ratio = np.where(
+            raised >= 0, given / np.asarray(self.scale) ** np.where(raised >= 0, power, 1.0), plain
+        )
+        centre, spread, size = (np.asarray(x) for x in (self.centre, self.spread, self.logarithmic))
+        positive = np.where(size & (ratio > 0), ratio, centre)
+        log = np.log(np.where(size, positive / np.where(size, centre, 1.0), 1.0)) / np.where(
+            size, np.log(spread), 1.0
+        )
+        return np.where(size, log, (np.maximum(ratio, np.asarray(self.lowest)) - centre) / spread)
+
+    def least(self) -> Float[np.ndarray, "slots most"]:
+        """Smallest unknowns that make sense."""
+        lowest = (np.asarray(self.lowest) - np.asarray(self.centre)) / np.asarray(self.spread)
+        return np.where(np.asarray(self.logarithmic), -np.inf, lowest)
+
+
+class Moved(NamedTuple):
+    """How the bodies move in one record, for the scales of effects.
+
+    Attributes:
+        displacements, velocities: (samples, N).
+        u: (samples, inputs).
+        y: (samples, outputs), NaN where there is nothing.
+        dt: sampling interval, s.
+    """
+
+    displacements: Float[np.ndarray, "samples N"]
+    velocities: Float[np.ndarray, "samples N"]
+    u: Float[np.ndarray, "samples inputs"]
+    y: Float[np.ndarray, "samples outputs"]
+    dt: float
+
+
+def effect_slots(model: LumpedModel, effects: Sequence[Effect]) -> Slots:
+    """The effects as arrays; one that does nothing where there is none.
+
+    Args:
+        model: names bodies, sensors and inputs.
+        effects: of the hypothesis.
+    """
+    slots = slots_of(
+        eqx.tree_at(lambda m: m.effects, model, tuple(effects), is_leaf=lambda x: x is model.effects)
+    )
+    if not effects:
+        one = lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype)  # noqa: E731
+        slots = Slots(jnp.asarray([kind_number(INERT)], jnp.int32), *map(one, _arrays(slots)))
+    return eqx.tree_at(lambda s: s.kinds, slots, by_sort(jnp.asarray(slots.kinds)))
+
+
+def _arrays(slots: Slots) -> tuple[Array, ...]:
+    return slots.parameters, slots.joints, slots.pushes, slots.sensors, slots.inputs
+
+
+def amplitudes_of(linear: SecondOrderModel, slots: Slots, moved: Sequence[Moved]) -> Amplitudes:
+    """How the places move, over all records.
+
+    Args:
+        linear: without effects.
+        slots: the places.
+        moved: each record.
+    """
+    each = []
+    for m in moved:
+        parts = (jnp.asarray(x) for x in (m.displacements, m.velocities, m.u, m.y))
+        q, v, u, y = parts
+        each.append(amplitudes(linear, slots, q, v, u, y, m.dt))
+    mean = (
+        np.sqrt(np.mean([np.asarray(x) ** 2 for x in field], axis=0)) for field in zip(*each, strict=True)
+    )
+    return Amplitudes(*mean)
+
+
+def coordinates_of(effects: Sequence[Effect], at: Amplitudes) -> Coordinates:
+    """The unknowns of effects.
+
+    Args:
+        effects: of the hypothesis.
+        at: how their places move.
+    """
+    rows = max(len(effects), 1)
+    table = {name: np.zeros((rows, MOST_PARAMETERS)) for name in Coordinates.__annotations__}
+    for name in ("spread", "scale"):
+        table[name][:] = 1.0
+    table["raised"][:], table["deviation"][:], table["lowest"][:] = -1, FIXED, -np.inf
+    table["centre"][len(effects) :, 0] = 1.0
+    for row, effect in enumerate(effects):
+        parameters = CATALOGUE[effect.kind].parameters
+        names = [p.name for p in parameters]
+        own = Amplitudes(*(np.asarray(x)[row] for x in at))
+        for i, p in enumerate(parameters):
+            values = _coordinate(p.prior)
+            scale = float(np.asarray(p.scale.of(own)))
+            values["scale"] = scale if np.isfinite(scale) and scale > 0 else 1.0
+            values["raised"] = names.index(p.raised) if p.raised else -1
+            values["per_record"] = p.prior.shape == "uniform" and effect.place[0][0] == "body"
+            for name, value in values.items():
+                table[name][row, i] = value
+    whole = {"logarithmic": bool, "per_record": bool, "raised": int}
+    return Coordinates(**{k: jnp.asarray(v.astype(whole.get(k, float))) for k, v in table.items()})
+
+
+def _coordinate(prior: Prior) -> dict[str, float]:
+    if prior.shape == "uniform":
+        return {"centre": 0.0, "spread": 1.0, "deviation": FLAT, "lowest": -np.inf, "logarithmic": 0}
+    return {
+        "centre": prior.centre,
+        "spread": prior.spread,
+        "deviation": 1.0,
+        "lowest": prior.lowest if prior.lowest > prior.centre - 3.99 * prior.spread else -np.inf,
+        "logarithmic": prior.shape == "log-normal",
+    }
+
+
+def parameter_rows(effects: Sequence[Effect]) -> Float[np.ndarray, "slots most"]:
+    """The parameters of effects in the order of their kinds; one neutral row where there is none.
+
+    Args:
+        effects: of the hypothesis.
+    """
+    found = np.zeros((max(len(effects), 1), MOST_PARAMETERS))
+    found[len(effects) :, 0] = 1.0
+    for row, effect in enumerate(effects):
+        for i, p in enumerate(CATALOGUE[effect.kind].parameters):
+            found[row, i] = np.ravel(np.asarray(effect.parameters.get(p.name, p.default), float))[0]
+    return found
+
+
+def with_parameters(effect: Effect, values: Mapping[str, Array | float | np.ndarray]) -> Effect:
+    """The same effect with other parameters.
+
+    Args:
+        effect: its kind and place.
+        values: by name, SI units.
+    """
+    return Effect(effect.kind, effect.place, dict(values))

@@ -1,0 +1,315 @@
+"""Hypotheses of what a model lacks, fitted to records by simulation: effects, wrong numbers, or neither."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.gap.hypothesis import (
+    Moved,
+    amplitudes_of,
+    coordinates_of,
+    effect_slots,
+    parameter_rows,
+    with_parameters,
+)
+from jaxsid.gap.noise import Noise, residual_noise
+from jaxsid.gap.recalibrate import WIDE, Recalibrated
+from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
+from jaxsid.gap.shooting import STEPS, Fit, Prior, Shot, fitted, parameters_of, products
+from jaxsid.gap.spectra import in_time
+from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.first_order import physical_displacement_velocity
+from jaxsid.mechanics.lumped import Effect, LumpedModel, free_bodies, second_order
+from jaxsid.mechanics.simulate import ordered_inputs
+from jaxsid.physical.elements import element_matrices, with_values
+from jaxsid.records import Record
+
+FIXED = 1e-9  # deviation of what does not vary
+MOST_ELEMENT = 0.3  # largest relative change of an element in a step
+MOST_UNKNOWN = 2.0  # of an unknown of an effect
+LEAST_ELEMENT = -0.95
+STEPS_A_PERIOD = 20.0  # of the quickest vibration
+MOST_SUBSTEPS = 8
+
+
+class Bench(NamedTuple):
+    """Records, cut and weighed, that hypotheses are fitted to.
+
+    Attributes:
+        model: nominal, without effects.
+        blocks: of windows.
+        states: of every block (windows, 2 N), those of the best linear model.
+        moved: how the bodies move in every record.
+        tolerance: (e,) standard deviations of the elements' relative changes.
+        wide: (e,) likewise, of elements that are wrong.
+        still: (2 N,) standard deviations of initial states, far above what they are.
+        records: how many there are.
+        substeps: steps for each sampling interval.
+        noises: of each record, that the blocks are weighed by.
+    """
+
+    model: LumpedModel
+    blocks: tuple[Block, ...]
+    states: tuple[Float[np.ndarray, "windows n"], ...]
+    moved: tuple[Moved, ...]
+    tolerance: Float[np.ndarray, " e"]
+    wide: Float[np.ndarray, " e"]
+    still: Float[np.ndarray, " n"]
+    records: int
+    substeps: int
+    noises: tuple[Noise, ...]
+
+    def part(self, blocks: int) -> "Bench":
+        """The same with some blocks only, from all along the records.
+
+        Args:
+            blocks: how many.
+        """
+        chosen = np.unique(
+            np.linspace(0, len(self.blocks) - 1, min(blocks, len(self.blocks))).round().astype(int)
+        )
+        return self._replace(
+            blocks=tuple(self.blocks[i] for i in chosen), states=tuple(self.states[i] for i in chosen)
+        )
+
+
+class Hypothesis(NamedTuple):
+    """What may be the matter.
+
+    Attributes:
+        effects: that the model lacks, with parameters to begin with.
+        wrong: numbers of elements that may be far off.
+    """
+
+    effects: tuple[Effect, ...] = ()
+    wrong: tuple[int, ...] = ()
+
+
+class Refit(NamedTuple):
+    """A fitted hypothesis.
+
+    Attributes:
+        hypothesis: its effects with fitted parameters, those of the first record.
+        fit: unknowns and how well they fit.
+        model: with the fitted numbers and effects.
+        deviations: of each effect's parameters, by name.
+        shot: as it was simulated.
+    """
+
+    hypothesis: Hypothesis
+    fit: Fit
+    model: LumpedModel
+    deviations: tuple[dict[str, float], ...]
+    shot: Shot
+
+
+def bench_of(
+    model: LumpedModel, records: Sequence[Record], noises: Sequence[Noise], refit: Recalibrated
+) -> Bench:
+    """Records ready for fits.
+
+    Args:
+        model: nominal; its effects are left out.
+        records: with some of its sensors each.
+        noises: of each.
+        refit: the best linear model beside the records.
+    """
+    model = _without_effects(model)
+    dt = min(float(r.dt) for r in records)
+    longest = max(len(r.y) for r in records)
+    # small disturbing forces drive a free axis away from any long simulation
+    length = SHORTEST if free_bodies(model).shape[1] else window_length(slowest_rate(model), dt, longest)
+    blocks = blocks_of(model, records, noises, length)
+    motions = [
+        np.asarray(in_time(s.spectra, x.motion.states))
+        for s, x in zip(refit.settings, refit.linear, strict=True)
+    ]
+    size = len(model.bodies)
+    moved = []
+    for record, motion, setting in zip(records, motions, refit.settings, strict=True):
+        present = np.asarray(setting.spectra.present) > 0
+        y = np.where(present, np.asarray(in_time(setting.spectra, setting.spectra.y)), np.nan)
+        u = np.asarray(ordered_inputs(model, record)[0])
+        moved.append(Moved(motion[:, :size], motion[:, size:], u, y, float(record.dt)))
+    listed = element_matrices(model).listed
+    nominal = np.asarray(element_matrices(model).nominal)
+    near, far = (
+        np.where(nominal != 0, [of[x.quantity] for x in listed], FIXED)
+        for of in (model.tolerance._asdict(), WIDE)
+    )
+    still = np.sqrt(np.mean([(m**2).mean(axis=0) for m in motions], axis=0))
+    half = np.repeat([still[:size].max(), still[size:].max()], size)
+    return Bench(
+        model,
+        blocks,
+        tuple(_states_at(b, motions[int(b.record[0])]) for b in blocks),
+        tuple(moved),
+        np.maximum(near, FIXED),
+        far,
+        LARGE * np.maximum(half, np.finfo(float).tiny),
+        len(records),
+        _substeps(model, max(float(r.dt) for r in records)),
+        tuple(noises),
+    )
+
+
+def _substeps(model: LumpedModel, dt: float) -> int:
+    """Enough for a law that acts as quickly as the model vibrates where it can be seen to."""
+    plain = physical_displacement_velocity(second_order(model))
+    rates = np.abs(np.linalg.eigvals(np.asarray(plain.A)).imag)
+    quickest = min(float(rates.max(initial=0.0)), np.pi / dt)
+    return int(np.clip(np.ceil(STEPS_A_PERIOD * quickest * dt / (2 * np.pi)), 1, MOST_SUBSTEPS))
+
+
+def _without_effects(model: LumpedModel) -> LumpedModel:
+    return eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda x: x is model.effects)
+
+
+def weighed_anew(bench: Bench, found: Refit) -> Bench:
+    """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
+
+    Args:
+        bench: records.
+        found: a fit to all of it.
+    """
+    lefts = [np.asarray(x) for x in left_in_windows(bench, found)]
+    noises, blocks = list(bench.noises), list(bench.blocks)
+    for number, noise in enumerate(bench.noises):
+        own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
+        seen = np.concatenate([np.asarray(blocks[i].weight)[:, blocks[i].lead :] > 0 for i in own])
+        left = np.concatenate([lefts[i][:, blocks[i].lead :] for i in own])
+        whole = np.all(seen.any(axis=2), -1)
+        if noise.degrees > 0 or whole.sum() == 0:
+            continue
+        noises[number] = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
+        level = noises[number].level
+        inverse = jnp.asarray(
+            np.where(np.isfinite(level) & (level > 0), 1 / np.where(level > 0, level, 1.0), 0.0)
+        )
+        for i in own:
+            b = blocks[i]
+            taps = jnp.broadcast_to(jnp.asarray(noises[number].taps), b.taps.shape)
+            blocks[i] = eqx.tree_at(lambda x: (x.weight, x.taps), b, ((b.weight > 0) * inverse, taps))
+    return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
+
+
+def left_in_windows(bench: Bench, found: Refit) -> list[Array]:
+    """What a fit leaves of every block, simulated less measured.
+
+    Args:
+        bench: that it was fitted to.
+        found: the fit.
+    """
+    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
+    return [
+        products(found.shot, block, theta, jnp.asarray(states), substeps).left
+        for block, states in zip(bench.blocks, found.fit.states, strict=True)
+    ]
+
+
+def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:
+    at = np.asarray(block.first)
+    return np.where((at >= 0)[:, None], motion[np.clip(at, 0, len(motion) - 1)], 0.0)
+
+
+def refitted(
+    bench: Bench,
+    hypothesis: Hypothesis,
+    *,
+    changes: Float[np.ndarray, " e"] | None = None,
+    states: Sequence[np.ndarray] | None = None,
+    steps: int = STEPS,
+) -> Refit:
+    """A hypothesis fitted to a bench.
+
+    Args:
+        bench: records.
+        hypothesis: effects with parameters to begin with.
+        changes: of elements to begin with; none where left out.
+        states: of every block, hidden ones too, to begin with; else those of the best linear model.
+        steps: most evaluations.
+    """
+    effects = hypothesis.effects
+    shot = _shot(bench, effects)
+    slots = shot.slots
+    z = shot.coordinates.unknowns(parameter_rows(effects))
+    prior = _prior(bench, hypothesis, shot)
+    start = np.zeros(len(bench.tolerance)) if changes is None else np.asarray(changes)
+    theta = np.concatenate([start, z.ravel(), np.zeros((bench.records - 1) * len(z))])
+    own = 2 * slots.count
+    given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
+    fit = fitted(
+        shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=bench.substeps, steps=steps
+    )
+    return _concluded(bench, hypothesis, shot, fit)
+
+
+def _shot(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
+    linear, slots = second_order(bench.model), effect_slots(bench.model, effects)
+    coordinates = coordinates_of(effects, amplitudes_of(linear, slots, bench.moved))
+    return Shot(linear, element_directions(bench.model), slots, coordinates)
+
+
+def plain_shot(bench: Bench) -> Shot:
+    """The model without any effect, ready to be simulated."""
+    return _shot(bench, ())
+
+
+def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
+    elements = bench.tolerance.copy()
+    elements[list(hypothesis.wrong)] = bench.wide[list(hypothesis.wrong)]
+    own = np.asarray(shot.coordinates.deviation).ravel()
+    each = np.asarray(shot.coordinates.per_record).any(axis=1)
+    shifts = np.tile(np.where(each, np.pi, FIXED), bench.records - 1)
+    deviation = np.concatenate([elements, own, shifts])
+    least = np.concatenate(
+        [
+            np.full(len(elements), LEAST_ELEMENT),
+            shot.coordinates.least().ravel(),
+            np.full(len(shifts), -np.inf),
+        ]
+    )
+    most = np.where(np.arange(len(deviation)) < len(elements), MOST_ELEMENT, MOST_UNKNOWN)
+    size = len(bench.still) // 2
+    # an effect's own state is about as large as what moves there
+    hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], shot.slots.count)
+    return Prior(deviation, np.zeros(len(deviation)), least, most, np.concatenate([bench.still, hidden]))
+
+
+def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Refit:
+    elements, effects = len(bench.tolerance), hypothesis.effects
+    theta = jnp.asarray(fit.theta)
+    rows = np.asarray(parameters_of(shot, theta, 0))
+    slopes = _slopes(shot, fit.theta)
+    covariance = slopes @ fit.covariance @ slopes.T
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(rows.shape)
+    found, deviations = [], []
+    for row, effect in enumerate(effects):
+        names = [p.name for p in CATALOGUE[effect.kind].parameters]
+        every = [np.asarray(parameters_of(shot, theta, i))[row] for i in range(bench.records)]
+        own = np.asarray(shot.coordinates.per_record)[row]
+        values = {
+            n: np.array([x[i] for x in every]) if own[i] and bench.records > 1 else float(rows[row, i])
+            for i, n in enumerate(names)
+        }
+        found.append(with_parameters(effect, values))
+        deviations.append({n: float(deviation[row, i]) for i, n in enumerate(names)})
+    nominal = np.asarray(element_matrices(bench.model).nominal)
+    model = with_values(bench.model, jnp.asarray(nominal * (1 + fit.theta[:elements])))
+    model = _with_effects(model, tuple(found))
+    return Refit(Hypothesis(tuple(found), hypothesis.wrong), fit, model, tuple(deviations), shot)
+
+
+def _slopes(shot: Shot, theta: np.ndarray) -> np.ndarray:
+    """(slots * most, p) of the first record's parameters."""
+    return np.asarray(jax.jacfwd(lambda t: parameters_of(shot, t, 0).ravel())(jnp.asarray(theta)))
+
+
+def _with_effects(model: LumpedModel, effects: tuple[Effect, ...]) -> LumpedModel:
+    return eqx.tree_at(lambda m: m.effects, model, effects, is_leaf=lambda x: x is model.effects)

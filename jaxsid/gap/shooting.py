@@ -1,0 +1,330 @@
+"""Fits of a hypothesis to records by simulation in windows, each from an initial state that is found with the rest.
+
+Multiple shooting without ties (H. Bock, 1983): no window is long enough for a wrong start to lead astray, and none
+shorter than a few vibrations. One compiled program gives, for a block of windows of fixed size, all products of
+residuals and slopes that a step of Gauss and Newton needs; it knows kinds of effects by their sorts only. The search
+itself runs outside, so that few programs serve all candidates and records of any length.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsid.compilation import compiled_in_full
+from jaxsid.gap.hypothesis import Coordinates
+from jaxsid.gap.windows import Block
+from jaxsid.mechanics.augmented import augmented
+from jaxsid.mechanics.nonlinear import forced, respond_to
+from jaxsid.mechanics.slots import Slots
+from jaxsid.physical.motion import counted
+from jaxsid.records import SecondOrderModel
+
+STEPS = 25  # of the search
+GAIN = 0.05  # of the cost: a helpful step that brings less ends it
+PART = 1e-5  # or this part of it
+DAMPING = 1e-3  # to begin with
+MOST_DAMPING = 1e8
+RIDGE = 1e-13  # of a matrix with ones on its diagonal: less than its rounding matters
+
+
+class Shot(eqx.Module):
+    """A hypothesis ready to be simulated.
+
+    Attributes:
+        linear: the nominal model without effects.
+        directions: (e, N, N) each, what the elements add to M, D, K, times their values.
+        slots: effects; their parameters do not count.
+        coordinates: of their unknowns.
+    """
+
+    linear: SecondOrderModel
+    directions: tuple[Array, Array, Array]
+    slots: Slots
+    coordinates: Coordinates
+
+
+class Products(NamedTuple):
+    """Of every window: products of all slopes and the residual, in this order: unknowns, initial state, residual.
+
+    Attributes:
+        gram: (windows, p + n + 1, p + n + 1).
+        left: (windows, lead + length, outputs) simulated less measured.
+    """
+
+    gram: Float[Array, "windows q q"]
+    left: Float[Array, "windows length outputs"]
+
+
+class Fit(NamedTuple):
+    """Where the posterior of a hypothesis is largest.
+
+    Attributes:
+        theta: (p,) unknowns: relative changes of elements, those of effects, further phases of effects.
+        states: of each block (windows, n).
+        squares: sum of squares of the weighted residual.
+        equations: number of them.
+        covariance: (p, p) of the unknowns.
+        evidence: its logarithm after Laplace, up to what all hypotheses share.
+        steps: of the search.
+        settled: whether it came to an end by itself.
+    """
+
+    theta: Float[np.ndarray, " p"]
+    states: tuple[Float[np.ndarray, "windows n"], ...]
+    squares: float
+    equations: int
+    covariance: Float[np.ndarray, "p p"]
+    evidence: float
+    steps: int
+    settled: bool
+
+
+class Prior(NamedTuple):
+    """Normal priors.
+
+    Attributes:
+        deviation, mean: (p,) of the unknowns.
+        least: (p,) smallest values that make sense.
+        most: (p,) largest change in a step.
+        states: (n,) standard deviations of initial states.
+    """
+
+    deviation: Float[np.ndarray, " p"]
+    mean: Float[np.ndarray, " p"]
+    least: Float[np.ndarray, " p"]
+    most: Float[np.ndarray, " p"]
+    states: Float[np.ndarray, " n"]
+
+
+@compiled_in_full
+def products(shot: Shot, block: Block, theta: Array, states: Array, substeps: Array) -> Products:
+    """What a step needs of a block.
+
+    Args:
+        shot: the hypothesis.
+        block: windows.
+        theta: (p,) unknowns.
+        states: (windows, n) initial ones.
+        substeps: steps for each sampling interval.
+    """
+    p, n = len(theta), states.shape[1]
+
+    def window(u: Array, y: Array, weight: Array, taps: Array, first: Array, record: Array, state: Array):
+        def residual(move: Array) -> tuple[Array, tuple[Array, Array]]:
+            of_record = parameters_of(shot, theta + move[:p], record)
+            outputs = _outputs(shot, theta + move[:p], of_record, state + move[p:], u, first, block, substeps)
+            left = outputs - y
+            r = _white(left, weight, taps)
+            return r, (left, r)
+
+        slopes, (left, r) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(p + n, theta.dtype))
+        rows = jnp.concatenate([slopes, r[:, None]], axis=1)
+        return Products(rows.T @ rows, left)
+
+    parts = block.u, block.y, block.weight, block.taps, block.first, block.record, states
+    return jax.vmap(window)(*parts)
+
+
+def parameters_of(shot: Shot, theta: Array, record: Array | int) -> Float[Array, "slots most"]:
+    """Parameters of the effects in a record.
+
+    Args:
+        shot: the hypothesis.
+        theta: (p,) unknowns.
+        record: number of the record.
+    """
+    elements, coordinates = len(shot.directions[0]), shot.coordinates
+    count = coordinates.centre.size
+    z = theta[elements : elements + count].reshape(coordinates.centre.shape)
+    further = theta[elements + count :].reshape(-1, len(coordinates.centre))
+    shift = jnp.concatenate([jnp.zeros((1, further.shape[1]), z.dtype), further])[record]
+    return coordinates.parameters(jnp.where(coordinates.per_record, z + shift[:, None], z))
+
+
+def matrices_of(shot: Shot, theta: Array) -> SecondOrderModel:
+    """The linear model with its elements changed.
+
+    Args:
+        shot: the hypothesis.
+        theta: (p,) unknowns.
+    """
+    change = theta[: len(shot.directions[0])]
+    linear = shot.linear
+    moved = [
+        x + jnp.einsum("e,eij->ij", change, d)
+        for x, d in zip((linear.mass, linear.damping, linear.stiffness), shot.directions, strict=True)
+    ]
+    return eqx.tree_at(lambda s: (s.mass, s.damping, s.stiffness), linear, tuple(moved))
+
+
+def _outputs(
+    shot: Shot,
+    theta: Array,
+    parameters: Array,
+    state: Array,
+    u: Array,
+    first: Array,
+    block: Block,
+    substeps: Array,
+) -> Float[Array, "length outputs"]:
+    slots = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters)
+    # the linear part does not depend on phases: one for all records
+    common = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters_of(shot, theta, 0))
+    system = augmented(matrices_of(shot, theta), common)
+    late = forced(system, common, u, block.ramps, block.dt)
+    late = eqx.tree_at(lambda x: x[:4], late, tuple(x[block.lead :] for x in late[:4]))
+    return respond_to(system, slots, late, block.dt, state, substeps, first).outputs
+
+
+def _white(left: Array, weight: Array, taps: Array) -> Float[Array, " rows"]:
+    r = jnp.where(weight > 0, left, 0.0)
+    white = sum(taps[:, k] * jnp.roll(r, k, axis=0) for k in range(taps.shape[1]))
+    return (white * counted(weight[None], taps)[0]).ravel()
+
+
+def fitted(
+    shot: Shot,
+    blocks: Sequence[Block],
+    prior: Prior,
+    theta: Float[np.ndarray, " p"],
+    states: Sequence[Float[np.ndarray, "windows n"]],
+    *,
+    substeps: int,
+    steps: int = STEPS,
+) -> Fit:
+    """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated window by
+    window.
+
+    Args:
+        shot: the hypothesis.
+        blocks: windows of the records.
+        prior: of unknowns and states.
+        theta: (p,) to begin with.
+        states: likewise, of each block.
+        substeps: steps for each sampling interval.
+        steps: most evaluations.
+    """
+    at = _evaluated(shot, blocks, prior, theta, list(states), substeps)
+    damping, growth, settled, done = DAMPING, 2.0, False, 1
+    while done < steps and np.isfinite(at.cost):
+        move, moves = _step(at, prior, damping)
+        new = np.maximum(at.theta + move, prior.least)
+        found = _evaluated(
+            shot, blocks, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
+        )
+        done += 1
+        gain = at.cost - found.cost
+        if gain > 0:
+            at, damping, growth = found, max(damping / 5, 1e-9), 2.0
+            if gain < GAIN + PART * abs(found.cost):
+                settled = True
+                break
+        else:
+            damping, growth = damping * growth, 2 * growth
+            if damping > MOST_DAMPING:
+                settled = True
+                break
+    return _concluded(at, blocks, prior, done, settled)
+
+
+class _At(NamedTuple):
+    """A point of the search: unknowns, states, cost, its squares, gram (windows, q, q) of all windows."""
+
+    theta: np.ndarray
+    states: list[np.ndarray]
+    cost: float
+    squares: float
+    gram: np.ndarray
+
+
+def _evaluated(
+    shot: Shot,
+    blocks: Sequence[Block],
+    prior: Prior,
+    theta: np.ndarray,
+    states: list[np.ndarray],
+    substeps: int,
+) -> _At:
+    number = jnp.asarray(substeps)
+    parts = [
+        np.asarray(products(shot, b, jnp.asarray(theta), jnp.asarray(s), number).gram)
+        for b, s in zip(blocks, states, strict=True)
+    ]
+    gram = np.concatenate(parts)
+    squares = float(gram[:, -1, -1].sum())
+    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (
+        (np.concatenate(states) / prior.states) ** 2
+    ).sum()
+    cost = 0.5 * (squares + float(own))
+    return _At(
+        theta, states, cost if np.isfinite(gram).all() and np.isfinite(cost) else np.inf, squares, gram
+    )
+
+
+def _normal(at: _At, prior: Prior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Second derivatives of the cost: of unknowns (p, p), mixed (windows, n, p), of states (windows, n, n)."""
+    p = len(at.theta)
+    own = at.gram[:, :p, :p].sum(axis=0) + np.diag(prior.deviation**-2)
+    inner = at.gram[:, p:-1, p:-1] + np.diag(prior.states**-2)
+    return own, at.gram[:, p:-1, :p], inner
+
+
+def _step(at: _At, prior: Prior, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Changes of unknowns and of the states of every block."""
+    p = len(at.theta)
+    own, mixed, inner = _normal(at, prior)
+    own = own + damping * np.diag(np.diag(own))
+    inner = inner + damping * inner * np.eye(inner.shape[1])
+    slope = at.gram[:, :p, -1].sum(axis=0) + (at.theta - prior.mean) / prior.deviation**2
+    slopes = at.gram[:, p:-1, -1] + np.concatenate(at.states) / prior.states**2
+    solved = _solved(inner, np.concatenate([mixed, slopes[:, :, None]], axis=2))
+    back, ahead = solved[:, :, :p], solved[:, :, p]
+    reduced = own - np.einsum("wnp,wnq->pq", mixed, back)
+    move = -_solved(reduced, (slope - np.einsum("wnp,wn->p", mixed, ahead))[:, None])[:, 0]
+    move = move / max(1.0, np.abs(move / prior.most).max())
+    moves = -ahead - np.einsum("wnp,p->wn", back, move)
+    return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
+
+
+def _solved(
+    matrix: Float[np.ndarray, "*w n n"], right: Float[np.ndarray, "*w n k"]
+) -> Float[np.ndarray, "*w n k"]:
+    """Of positive matrices whose rows differ by orders of magnitude."""
+    scale, scaled = _unit(matrix)
+    whole = scaled + RIDGE * np.eye(scaled.shape[-1])
+    return np.linalg.solve(whole, right / scale[..., :, None]) / scale[..., :, None]
+
+
+def _unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    return scale, matrix / scale[..., :, None] / scale[..., None, :]
+
+
+def _log_determinant(matrix: np.ndarray) -> np.ndarray:
+    scale, scaled = _unit(matrix)
+    return np.asarray(2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1])
+
+
+def _concluded(at: _At, blocks: Sequence[Block], prior: Prior, steps: int, settled: bool) -> Fit:
+    own, mixed, inner = _normal(at, prior)
+    if not np.isfinite(at.cost):
+        nothing = np.full((len(own), len(own)), np.nan)
+        return Fit(at.theta, tuple(at.states), np.inf, 1, nothing, -np.inf, steps, False)
+    reduced = own - np.einsum("wnp,wnq->pq", mixed, _solved(inner, mixed))
+    determinant = float(_log_determinant(reduced) + _log_determinant(inner).sum())
+    determinant += 2 * float(np.log(prior.deviation).sum() + len(inner) * np.log(prior.states).sum())
+    return Fit(
+        theta=at.theta,
+        states=tuple(at.states),
+        squares=at.squares,
+        equations=sum(int((np.asarray(b.weight) > 0).sum()) for b in blocks),
+        covariance=_solved(reduced, np.eye(len(reduced))),
+        evidence=-at.cost - 0.5 * determinant,
+        steps=steps,
+        settled=settled,
+    )

@@ -1,0 +1,91 @@
+"""What is concluded from explanations that were fitted: whether they explain enough, and which cannot be told apart."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsid.gap.causes import SLIGHT, Causes
+from jaxsid.gap.examine import Examination
+from jaxsid.gap.explain import Explanation
+from jaxsid.gap.null import left_share
+
+LIKELY = 0.9  # probability that the explanations named have together
+ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
+STEEP = 8.0  # how fast the probability of "unknown" grows about that
+
+
+class Verdict(NamedTuple):
+    """The conclusion.
+
+    Attributes:
+        name: "none", "effect", "ambiguous" or "unknown".
+        probability: of none, of an effect of the catalogue, of one that is not in it.
+        likely: for each effect that was found, the explanations that are not told apart, most probable first.
+    """
+
+    name: str
+    probability: dict[str, float]
+    likely: tuple[tuple[Explanation, ...], ...]
+
+
+def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
+    """What records and fits say.
+
+    Args:
+        found: the examination of the gap.
+        causes: what explains it; None where it agrees with noise.
+    """
+    doubt = float(min(found.nominal_p_value, found.structural_p_value))
+    if causes is None:
+        some = 0.5 * math.exp(-doubt / 0.05)
+        return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
+    if found.finding == "structure" and not causes.selected and _slight(found):
+        return Verdict("none", {"none": 0.5, "effect": 0.25, "unknown": 0.25}, ())
+    unexplained = _unexplained(causes)
+    probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
+    likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
+    if unexplained > 0.5:
+        return Verdict("unknown", probability, likely)
+    open_ones = any(len(x) > 1 for x in likely)
+    return Verdict("ambiguous" if open_ones else "effect", probability, likely)
+
+
+def _slight(found: Examination) -> bool:
+    """Whether what tests find is small beside the noise, so that no law could be told from it."""
+    return bool(found.null.share < SLIGHT * left_share(found.fit))
+
+
+def _unexplained(causes: Causes) -> float:
+    """Probability that the law is not in the catalogue: by how much of the gap the best one leaves."""
+    last = causes.closures[-1]
+    if not causes.selected and causes.chosen is not causes.recalibrated:
+        return 1.0
+    gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
+    return float(1 / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
+
+
+def _substantial(gap: float, floor: float) -> bool:
+    return gap > 1.5 * floor
+
+
+def _set(ranked: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
+    """The fewest that have most of the probability together."""
+    total, found = 0.0, []
+    whole = sum(x.probability for x in ranked) or 1.0
+    for x in ranked:
+        found.append(x)
+        total += x.probability / whole
+        if total >= LIKELY:
+            break
+    return tuple(found)
+
+
+def as_pair(x: Explanation) -> dict[str, Any]:
+    """Kind and place, as in diagnosis.json."""
+    return {"kind": x.kind, "place": plain_place(x.place)}
+
+
+def plain_place(place: dict[str, Any]) -> dict[str, Any]:
+    """A place with lists in the place of tuples."""
+    return {where: list(ends) if isinstance(ends, tuple | list) else ends for where, ends in place.items()}

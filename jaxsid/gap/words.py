@@ -1,0 +1,175 @@
+"""A diagnosis in sentences: the finding, what remains, what to measure next."""
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxsid.gap.causes import Causes
+from jaxsid.gap.examine import Examination
+from jaxsid.gap.explain import Explanation
+from jaxsid.gap.measure import Gap
+from jaxsid.gap.places import Place
+from jaxsid.gap.verdict import Verdict
+from jaxsid.mechanics.lumped import LumpedModel
+
+APART = 1.5  # gap in noise from which on refitted numbers are worth a word
+
+
+@runtime_checkable
+class Found(Protocol):
+    """What the sentences need of a diagnosis."""
+
+    @property
+    def nominal(self) -> LumpedModel: ...
+    @property
+    def examination(self) -> Examination: ...
+    @property
+    def causes(self) -> Causes | None: ...
+    @property
+    def judgement(self) -> Verdict: ...
+    @property
+    def verdict(self) -> str: ...
+    def selected(self) -> list[dict[str, Any]]: ...
+
+
+def kind_words(kind: str) -> str:
+    """A kind in words: "coulomb friction".
+
+    Args:
+        kind: its name.
+    """
+    return kind.replace("_", " ")
+
+
+def place_words(place: dict[str, Any]) -> str:
+    """A place in words, to follow a kind.
+
+    Args:
+        place: as of an `Effect`.
+    """
+    ((where, ends),) = place.items()
+    if where == "between":
+        return f"between {ends[0]} and {ends[1]}"
+    return f"{'on' if where == 'body' else 'of'} {ends}"
+
+
+def named(x: Explanation) -> str:
+    """Kind and place in words."""
+    return f"{kind_words(x.kind)} {place_words(x.place)}"
+
+
+def percent(x: float) -> str:
+    """With two digits."""
+    return f"{100 * x:.2g} %"
+
+
+def summary(found: Found) -> tuple[str, str]:
+    """The verdict and what it means, a sentence each.
+
+    Args:
+        found: the diagnosis.
+    """
+    causes = found.causes
+    if causes is None or found.verdict == "none":
+        told = "The records agree with the model, within its tolerance and the noise."
+        if causes is not None:
+            return (
+                told,
+                "Tests find a trace of something, too small beside the noise to be told or to matter.",
+            )
+        if found.examination.before.total > APART:
+            return told, "Its numbers are off by no more than they may be; refitted it leaves noise alone."
+        return told, "Nothing that the model lacks is to be seen in these records."
+    closure = causes.closures[-1]
+    shrinks = (
+        f"On samples that were not used the gap falls from {percent(closure.before)} to {percent(closure.after)}; "
+        f"noise alone leaves {percent(closure.noise_floor)}."
+    )
+    if found.verdict == "unknown":
+        likely = found.examination.locations
+        place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
+        return f"The model lacks something that no kind of effect in the catalogue explains.{place}", shrinks
+    if not causes.selected:
+        return "The model's structure is right, its numbers are not.", shrinks
+    what = " and ".join(_sentence(found, i) for i in range(len(causes.selected)))
+    if found.verdict == "ambiguous":
+        others = ", ".join(named(x) for likely in found.judgement.likely for x in likely[1:])
+        return f"{what[0].upper()}{what[1:]}. These records cannot tell it from {others}.", shrinks
+    return f"{what[0].upper()}{what[1:]}.", shrinks
+
+
+def _place(place: Place) -> str:
+    return " - ".join(place.ends) if place.where == "between" else f"{place.where} {place.ends[0]}"
+
+
+def _sentence(found: Found, number: int) -> str:
+    assert found.causes is not None
+    x = found.causes.selected[number]
+    given = found.selected()[number]["parameters"]
+    values = ", ".join(_value(name, p) for name, p in given.items())
+    return f"{named(x)} ({values}), probability {x.probability:.2f}"
+
+
+def _value(name: str, p: dict[str, Any]) -> str:
+    value = p["value"] if not isinstance(p["value"], list) else p["value"][0]
+    unit = f" {p['unit']}" if p["unit"] else ""
+    return f"{kind_words(name)} {value:.4g} ± {p['std']:.2g}{unit}"
+
+
+def remaining(found: Found) -> str:
+    """What is left once the selected effects are added.
+
+    Args:
+        found: the diagnosis.
+    """
+    causes, gap = found.causes, found.examination.recalibrated
+    if causes is None or found.verdict == "none":
+        return f"The linear model, its numbers refitted, leaves {gap.total:.3g} times the noise."
+    if causes.places is None:
+        return "What remains: nothing significant."
+    names = [s.name for s in found.nominal.sensors]
+    closure = causes.closures[-1]
+    worst = max(
+        names, key=lambda n: closure.by_sensor[n] if closure.by_sensor[n] == closure.by_sensor[n] else 0.0
+    )
+    band = _loudest(gap)
+    return (
+        f"What remains: {percent(closure.by_sensor[worst])} of {worst}, where noise alone leaves "
+        f"{percent(closure.noise_floor)}; the linear model misses most at {band}."
+    )
+
+
+def _loudest(gap: Gap) -> str:
+    rows = [row for row in gap.by_frequency if row["significant"]] or list(gap.by_frequency)
+    if not rows:
+        return "no band in particular"
+    low, high = max(rows, key=lambda row: row["noise_units"])["band_hz"]
+    return f"{low:.3g} to {high:.3g} Hz"
+
+
+def next_experiment(found: Found) -> str:
+    """What to measure next.
+
+    Args:
+        found: the diagnosis.
+    """
+    causes, places = found.causes, found.examination.locations
+    if causes is None or found.verdict == "none":
+        told = all(n.degrees > 0 for n in found.examination.noises)
+        return "" if told else "A record with repeated periods, or a quiet start, would tell the noise apart."
+    open_ones = [likely for likely in found.judgement.likely if len(likely) > 1]
+    if open_ones:
+        kinds = {x.kind for x in open_ones[0]}
+        if kinds & {"input_delay", "actuator_lag", "input_gain", "actuator_saturation"}:
+            return "What enters by a sensor of its own: it tells an error of the input from all else."
+        if kinds & {"coulomb_friction", "stribeck_friction", "quadratic_damping"}:
+            return (
+                "The same input at a third of its level, and a slow reversal: slow motion shows dry friction."
+            )
+        return "The same input at a third and at three times its level: how the force grows with it tells the law."
+    if found.verdict != "unknown" and causes.places is None:
+        return ""
+    if places is not None and len(places.likely) > 1:
+        ends = ", ".join(_place(place) for place in places.likely)
+        return f"One more sensor, on a body that {ends} move differently."
+    return (
+        "The same input at a third and at three times its level: how the force grows with it tells the law."
+    )

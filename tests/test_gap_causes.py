@@ -1,0 +1,312 @@
+"""What is concluded from fits, without fitting: rankings, sets, verdicts, numbers of a model as effects, offsets."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
+
+from jaxsid import diagnose
+from jaxsid.gap.causes import WORTH, Causes, _beyond, _worth
+from jaxsid.gap.closure import Closure, Left, fraction
+from jaxsid.gap.examine import Examination
+from jaxsid.gap.explain import (
+    TEMPERATURE,
+    Explanation,
+    Ranking,
+    _distinct,
+    _ranked,
+    alike,
+    elements_by_key,
+    extended,
+    key_of,
+)
+from jaxsid.gap.noise import FINEST, noise_of, residual_noise
+from jaxsid.gap.refit import Bench, Hypothesis, Refit
+from jaxsid.gap.screen import Candidate
+from jaxsid.gap.shooting import Fit
+from jaxsid.gap.verdict import verdict_of
+from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_model, second_order
+from jaxsid.physical.elements import element_matrices
+
+B12, B23 = {"between": ("b1", "b2")}, {"between": ("b2", "b3")}
+
+
+BENCH = Bench(chain(), (), (), (), np.zeros(9), np.zeros(9), np.zeros(6), 1, 2, ())  # of no matter here
+
+
+def refit(evidence, squares=1000.0, equations=1000, hypothesis=None):
+    nothing = np.zeros(1)
+    fit = Fit(nothing, (), squares, equations, np.eye(1), evidence, 5, True)
+    return Refit(hypothesis or Hypothesis(), fit, None, (), None)
+
+
+def candidate(kind, place, **parameters):
+    return Candidate(kind, place, parameters, np.zeros(9), 0.0, 1.0, "", {})
+
+
+def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
+    kinds = kinds or [("cubic_stiffness", B12), ("backlash", B12), ("end_stop", B12), ("hysteresis", B23)]
+    every = [
+        (candidate(*kinds[i]), refit(e, squares), e) for i, e in enumerate(evidences) if not math.isnan(e)
+    ]
+    return _ranked(every, refit(without), BENCH)
+
+
+# keys and numbers
+
+
+def test_the_order_of_two_ends_does_not_count():
+    assert key_of("backlash", {"between": ("b1", "b2")}) == key_of("backlash", {"between": ["b2", "b1"]})
+    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("end_stop", {"between": ("b1", "b2")})
+    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("backlash", {"between": ("b1", "b3")})
+    assert key_of("constant_load", {"body": "x"}) != key_of("constant_load", {"sensor": "x"})
+    assert len({key_of("sensor_gain", {"sensor": "ab"}), key_of("sensor_gain", {"sensor": "ba"})}) == 2
+
+
+def parallel():
+    """Two connections side by side between a and b."""
+    return lumped_model(
+        ["a", "b"],
+        [1.0, 2.0],
+        [10.0, 20.0, 30.0],
+        [0.1, 0.2, 0.3],
+        connections=[
+            Connection(n, e) for n, e in zip("wxy", [("ground", "a"), *[("a", "b")] * 2], strict=True)
+        ],
+        inputs=[Input("f", "a")],
+        sensors=[Sensor("s", "a", "velocity")],
+    )
+
+
+def matrices():
+    parts = (jnp.eye(2) + k * jnp.array([[1.0, -1.0], [-1.0, 1.0]]) for k in (0.0, 0.1, 5.0))
+    return lumped_model(
+        ["a", "b"],
+        matrices=Matrices(*parts),
+        inputs=[Input("f", "a")],
+        sensors=[Sensor("s", "a", "velocity")],
+    )
+
+
+@pytest.mark.parametrize("model", [chain(), parallel(), matrices()], ids=["chain", "parallel", "matrices"])
+def test_every_number_of_a_model_is_the_error_of_one_effect(model):
+    found, listed = elements_by_key(model), element_matrices(model).listed
+    rows = [i for own in found.values() for i in own]
+    assert sorted(rows) == list(range(len(listed)))
+    for (kind, where, ends), own in found.items():
+        assert {listed[i].quantity for i in own} == {kind.removesuffix("_error")}
+        # a mass between two bodies is no mass of a body
+        assert (where == "body") == (kind == "mass_error" and len(ends) == 1)
+        assert where == "body" or len(ends) == 2
+
+
+def test_numbers_bear_the_names_of_places():
+    found = elements_by_key(chain())
+    listed = element_matrices(chain()).listed
+    (row,) = found[key_of("stiffness_error", B12)]
+    assert (listed[row].element, listed[row].quantity) == ("c2", "stiffness")
+    (row,) = found[key_of("damping_error", {"between": ("ground", "b1")})]
+    assert (listed[row].element, listed[row].quantity) == ("c1", "damping")
+    (row,) = found[key_of("mass_error", {"body": "b3"})]
+    assert (listed[row].element, listed[row].quantity) == ("b3", "mass")
+    side_by_side = elements_by_key(parallel())[key_of("stiffness_error", {"between": ("b", "a")})]
+    assert [element_matrices(parallel()).listed[i].element for i in side_by_side] == ["x", "y"]
+    of_matrices = elements_by_key(matrices())
+    for key in (
+        ("stiffness_error", {"between": ("a", "b")}),
+        ("damping_error", {"between": ("ground", "b")}),
+    ):
+        assert key_of(*key) in of_matrices
+
+
+def test_hypotheses_grow_by_effects_and_by_wrong_numbers():
+    errors = elements_by_key(chain())
+    first = extended(Hypothesis(), candidate("cubic_stiffness", B12, coefficient=1e6), errors)
+    (effect,) = first.effects
+    assert (effect.kind, effect.place, first.wrong) == ("cubic_stiffness", (("between", ("b1", "b2")),), ())
+    assert effect.parameters == {"coefficient": 1e6}
+    second = extended(first, candidate("stiffness_error", {"between": ("b3", "b2")}, factor=1.2), errors)
+    assert second.effects == first.effects
+    assert second.wrong == errors[key_of("stiffness_error", B23)]
+    third = extended(second, candidate("mass_error", {"body": "b1"}, factor=1.2), errors)
+    assert third.wrong == tuple(sorted((*second.wrong, *errors[key_of("mass_error", {"body": "b1"})])))
+    # where the model has no connection an error of its stiffness is an effect
+    new = extended(Hypothesis(), candidate("stiffness_error", {"between": ("b1", "b3")}, factor=1.2), errors)
+    assert len(new.effects) == 1
+    again = [
+        candidate("cubic_stiffness", {"between": ("b2", "b1")}),
+        candidate("stiffness_error", B23),
+        candidate("cubic_stiffness", B23),
+        candidate("mass_error", {"body": "b2"}),
+    ]
+    assert _distinct(again, third, errors) == again[2:]
+
+
+# rankings
+
+
+def test_probabilities_are_tempered_evidences():
+    found = ranking(-40.0, 10.0, -2e3, without=-5e3, squares=2000.0)
+    assert [x.kind for x in found.ranked] == ["backlash", "cubic_stiffness", "end_stop"]
+    assert found.scale == 2.0
+    ratio = found.ranked[1].probability / found.ranked[0].probability
+    assert ratio == pytest.approx(math.exp(-50 / (2 * TEMPERATURE)))
+    assert sum(x.probability for x in found.ranked) == pytest.approx(1)
+
+
+def test_no_effect_at_all_is_an_alternative_too():
+    found = ranking(0.0, without=0.0)
+    assert found.ranked[0].probability == pytest.approx(0.5)
+    assert _ranked([], refit(0.0), BENCH).ranked == ()
+
+
+def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
+    found = ranking(0.0, -2.9 * TEMPERATURE, -3.1 * TEMPERATURE)
+    first, second, third = found.ranked
+    assert alike(first, second, found)
+    assert not alike(first, third, found)
+
+
+def test_a_further_effect_must_be_worth_it():
+    def worth(gain, less, before=3000.0):
+        best, without = refit(gain, before - less), refit(0.0, before)
+        one = Explanation("backlash", B12, best, gain, 1.0)
+        return _worth(Ranking((one,), without, 1.0, BENCH))
+
+    assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
+    assert not worth(0.99 * WORTH * TEMPERATURE, 210.0)
+    assert not worth(1e4, 190.0)  # of the 2000 above the noise less than a tenth
+    assert not worth(1e4, 15.0, before=1000.0)  # there is nothing but noise, of which less than 2 %
+    assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
+    assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
+
+
+# verdicts
+
+
+def examination(nominal=1e-9, structural=1e-9):
+    given = dict.fromkeys(Examination._fields)
+    return Examination(**{**given, "nominal_p_value": nominal, "structural_p_value": structural})
+
+
+def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
+    ends = fraction(before, after, floor), (0.0, 1.0), fraction(recalibrated, after, floor)
+    return Closure(before, recalibrated, after, floor, *ends, {})
+
+
+def causes(*rounds, closures):
+    chosen = [r.ranked[0] for r in rounds][: len(closures)]
+    last = chosen[-1].refit
+    nothing = Left((), ())
+    return Causes(
+        rounds, last, tuple(chosen), last, last, tuple(closures), nothing, (), None, None, (nothing, nothing)
+    )
+
+
+def test_none():
+    found = verdict_of(examination(0.4, 0.6), None)
+    assert (found.name, found.likely) == ("none", ())
+    assert found.probability["none"] > 0.99
+    assert sum(found.probability.values()) == pytest.approx(1)
+    doubtful = verdict_of(examination(0.006, 0.6), None)
+    assert 0.5 < doubtful.probability["none"] < 0.6
+
+
+def test_effect():
+    found = verdict_of(examination(), causes(ranking(0.0, -200.0), closures=[closure(0.012)]))
+    assert found.name == "effect"
+    assert [[x.kind for x in likely] for likely in found.likely] == [["cubic_stiffness"]]
+    assert found.probability["effect"] > 0.99
+    assert sum(found.probability.values()) == pytest.approx(1)
+
+
+def test_ambiguous_names_as_many_as_have_nine_tenths():
+    level = [TEMPERATURE * math.log(p) for p in (0.5, 0.3, 0.15, 0.05)]
+    found = verdict_of(examination(), causes(ranking(*level), closures=[closure(0.012)]))
+    assert found.name == "ambiguous"
+    assert [x.kind for x in found.likely[0]] == ["cubic_stiffness", "backlash", "end_stop"]
+    assert found.likely[0][0].probability == pytest.approx(0.5, abs=1e-6)
+
+
+def test_one_doubtful_effect_of_two_makes_it_ambiguous():
+    sure, open_one = ranking(0.0, -500.0), ranking(0.0, -5.0)
+    refused = ranking(0.0, -1.0)
+    given = [closure(0.1), closure(0.012)]
+    found = verdict_of(examination(), causes(sure, open_one, refused, closures=given))
+    assert found.name == "ambiguous"
+    assert [len(x) for x in found.likely] == [1, 2]
+    again = verdict_of(examination(), causes(sure, sure, open_one, closures=given))
+    assert again.name == "effect"
+
+
+def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
+    found = verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[closure(0.2)]))
+    assert found.name == "unknown"
+    assert found.probability["unknown"] > 0.95
+    # what counts is the last closure
+    two = causes(ranking(0.0, -500.0), ranking(0.0, -500.0), closures=[closure(0.2), closure(0.02)])
+    assert verdict_of(examination(), two).name == "effect"
+    # where the best linear model leaves noise, what counts is the gap of the nominal one
+    linear = closure(0.0101, recalibrated=0.0102)
+    assert linear.against_recalibrated < 0.5
+    assert verdict_of(examination(), causes(ranking(0.0), closures=[linear])).name == "effect"
+
+
+# offsets and records without noise
+
+
+def test_an_offset_is_no_noise():
+    signals = 0.1 * np.random.default_rng(0).standard_normal((4096, 2)) + np.array([5.0, 0.0])
+    found = residual_noise(signals)
+    np.testing.assert_allclose(found.level, 0.1, rtol=0.05)
+    np.testing.assert_allclose(found.rms(), 0.1, rtol=0.05)
+
+
+def test_computed_records_have_a_least_noise():
+    u = drive(SAMPLES, periods=4)
+    y = exact(u)
+    (noise,) = noise_of(chain(), [record(u, y)])
+    rms = np.sqrt((y**2).mean(axis=0))
+    assert (noise.level >= FINEST * rms).all()
+    assert (noise.level < 1e-2 * rms).all()
+
+
+def told(found):
+    (selected,) = found.as_dict()["selected"]
+    return selected["kind"], selected["place"], selected["parameters"]
+
+
+@pytest.mark.slow
+def test_a_bias_is_found_although_the_noise_is_not_told():
+    u = drive()
+    y = noisy(exact(u))
+    offset = 0.2 * y[:, 1].std()
+    y[:, 1] += offset
+    found = diagnose(chain(), record(u, y))
+    kind, place, parameters = told(found)
+    assert (found.verdict, kind, place) == ("effect", "sensor_bias", {"sensor": "s1"})
+    assert abs(parameters["offset"]["value"] - offset) < 3 * parameters["offset"]["std"]
+
+
+@pytest.mark.slow
+def test_a_load_is_found_although_the_noise_is_not_told():
+    u = drive()
+    kinds = tuple((body, "displacement") for body in range(3))
+    # a load that was there before the record adds its static displacements
+    static = np.linalg.solve(np.asarray(second_order(chain()).stiffness), [0.0, 3.0, 0.0])
+    y = noisy(exact(u, kinds)) + static
+    found = diagnose(chain(kinds), record(u, y, kinds))
+    kind, place, parameters = told(found)
+    assert (found.verdict, kind, place) == ("effect", "constant_load", {"body": "b2"})
+    assert abs(parameters["force"]["value"] - 3.0) < 3 * parameters["force"]["std"]
+
+
+@pytest.mark.slow
+def test_periodic_records_without_noise_are_diagnosed():
+    u = drive(SAMPLES, periods=4)
+    found = diagnose(chain(factor=1.02), record(u, exact(u)))
+    assert found.verdict == "effect"
+    assert {x["kind"] for x in found.as_dict()["selected"]} == {"stiffness_error"}
+    assert found.closure.fraction > 0.99

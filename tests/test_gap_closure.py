@@ -1,0 +1,192 @@
+"""Free runs over pieces against whole simulations, the closure against its closed form, its interval, windows."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gap_bench import bench, colored, known
+from gap_helpers import DT, SAMPLES, chain, drive, exact, record
+
+import jaxsid
+from jaxsid.gap import closure as module
+from jaxsid.gap.closure import HELD_OUT, Left, closure_of, fraction, held_out_begin, left_of, seen_part
+from jaxsid.gap.free_run import LEAD, PIECE, free_run
+from jaxsid.gap.hypothesis import parameter_rows
+from jaxsid.gap.refit import FIXED, Hypothesis, _shot, refitted
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.lumped import Effect
+
+LONG = 2 * PIECE + 700
+HALF = SAMPLES // 4 * 3
+
+
+def effect(kind, place, **parameters):
+    return Effect(kind, ((CATALOGUE[kind].where, place),), parameters)
+
+
+@pytest.fixture(scope="module")
+def of():
+    return bench(*colored(exact(drive()), 0))
+
+
+def run(of, effects, u, *, first=0, state=None, changes=0.0, substeps=2):
+    shot = _shot(of, effects)
+    z = shot.coordinates.unknowns(parameter_rows(effects))
+    theta = np.concatenate([np.full(9, changes), z.ravel()])
+    state = np.zeros(6 + 2 * shot.slots.count) if state is None else state
+    ramps = jnp.zeros(1, bool)
+    given = {"record": 0, "first": first, "substeps": substeps}
+    return free_run(shot, theta, u[:, None], ramps, DT, state, **given).outputs
+
+
+def test_a_linear_run_is_exact(of):
+    start = np.array([0.02, 0.0, -0.03, 0.3, 0.0, 0.1])
+    u = drive(LONG)
+    y = run(of, (), u, state=np.pad(start, (0, 2)))
+    assert y.shape == (LONG, 3)
+    truth = exact(u, start=start)
+    np.testing.assert_allclose(y, truth, atol=1e-9 * truth.std())
+
+
+def test_a_run_may_begin_anywhere(of):
+    u, before = drive(LONG), 40
+    early = run(of, (), u, first=-before)  # at rest before the record, where inputs are zero
+    np.testing.assert_allclose(early[before:], exact(u), atol=1e-9 * exact(u).std())
+    assert not early[:before].any()
+    begin = PIECE + 100
+    q, v = (exact(u, [(b, kind) for b in range(3)]) for kind in ("displacement", "velocity"))
+    late = run(of, (), u, first=begin, state=np.concatenate([q[begin], v[begin], np.zeros(2)]))
+    np.testing.assert_allclose(late, exact(u)[begin:], atol=1e-9 * exact(u).std())
+
+
+MANY = [
+    (effect("cubic_stiffness", ("b1", "b2"), coefficient=1e6), 1e-9),
+    (effect("input_delay", "drive", delay=0.034), 1e-9),
+    (effect("sensor_delay", "s1", delay=0.034), 1e-9),
+    (effect("sensor_delay", "s1", delay=(LEAD - 20) * DT), 1e-9),
+    (effect("time_varying_stiffness", ("b1", "b2"), rate=5.0), 1e-9),
+    (effect("coulomb_friction", ("ground", "b1"), force=2.0), 1e-6),
+]
+
+
+@pytest.mark.parametrize(
+    ("x", "tolerance"), [MANY[0], *(pytest.param(*m, marks=pytest.mark.slow) for m in MANY[1:])]
+)
+def test_pieces_are_the_whole_simulation(of, x, tolerance):
+    u = drive(LONG)
+    y = run(of, (x,), u, substeps=2)
+    data = record(u, np.zeros((LONG, 3)))
+    truth = np.asarray(jaxsid.simulate(chain(effects=[x]), data, substeps=2))
+    np.testing.assert_allclose(y, truth, atol=tolerance * truth.std())
+    plain = exact(u)
+    assert np.sqrt(((truth - plain)[PIECE:] ** 2).mean()) > 1e-3 * plain.std()  # the effect is to be seen
+
+
+def test_the_fraction():
+    assert fraction(0.5, 0.3, 0.0) == pytest.approx(0.4)
+    assert fraction(0.5, 0.3, 0.3) == 1.0
+    assert fraction(np.hypot(0.5, 0.2), np.hypot(0.1, 0.2), 0.2) == pytest.approx(0.8)
+    assert fraction(0.5, 0.5, 0.1) == 0.0
+    assert fraction(0.5, 0.6, 0.1) == 0.0  # it did not shrink
+    assert fraction(0.5, 0.09, 0.1) == 1.0  # less than noise is noise
+    assert fraction(0.1, 0.05, 0.1) == 0.0  # no gap to shrink
+    assert fraction(0.1, 0.05, 0.2) == 0.0
+
+
+def drawn(seed, sizes, samples=1600):
+    """What three models leave of two sensors, white, the second absent from one of two records."""
+    rng = np.random.default_rng(seed)
+    scale = np.array([1.0, 5.0])
+    white = lambda size: tuple(size * scale * rng.standard_normal((samples, 2)) for _ in range(2))  # noqa: E731
+    measured = white(1.0)
+    hidden = np.where([[True, False]], 0.0, np.nan)
+    masked = lambda x: (x[0], x[1] + hidden)  # noqa: E731
+    return [Left(masked(white(size)), masked(measured)) for size in sizes], scale
+
+
+def test_the_closure_is_that_of_what_is_left():
+    sizes, noise = (0.5, 0.3, 0.14), 0.1
+    (nominal, linear, after), scale = drawn(0, sizes)
+    noises = [
+        known(noise * scale * np.sqrt(1 - 0.25))
+    ] * 2  # coloured: its deviation is that of white / sqrt(1 - a^2)
+    found = closure_of(nominal, linear, after, noises, ["a", "b"])
+    np.testing.assert_allclose([found.before, found.recalibrated, found.after], sizes, rtol=0.04)
+    assert found.noise_floor == pytest.approx(noise, rel=0.03)
+    assert found.fraction == fraction(found.before, found.after, found.noise_floor)
+    assert found.against_recalibrated == fraction(found.recalibrated, found.after, found.noise_floor)
+    assert found.fraction == pytest.approx(0.8, abs=0.02)
+    by_hand = (
+        np.concatenate([x[:, 0] for x in after.left]).std()
+        / np.concatenate([x[:, 0] - x[:, 0].mean() for x in after.measured]).std()
+    )
+    assert found.by_sensor["a"] == pytest.approx(by_hand, rel=1e-3)
+    assert set(found.by_sensor) == {"a", "b"}
+    assert set(found.as_dict()) == {
+        "heldout_before",
+        "heldout_recalibrated",
+        "heldout_after",
+        "noise_floor",
+        "fraction",
+        "ci95",
+        "against_recalibrated",
+        "by_sensor",
+    }
+
+
+def test_the_interval_covers(monkeypatch):
+    monkeypatch.setattr(module, "DRAWS", 300)
+    sizes, noise = (0.5, 0.3, 0.2), 0.1
+    truth = fraction(sizes[0], sizes[2], noise)
+    inside, widths = 0, []
+    for seed in range(40):
+        lefts, scale = drawn(seed, sizes, 400)
+        found = closure_of(*lefts, [known(noise * scale * np.sqrt(0.75))] * 2, ["a", "b"])
+        inside += found.ci95[0] <= truth <= found.ci95[1]
+        widths.append(found.ci95[1] - found.ci95[0])
+    assert inside >= 34
+    assert np.mean(widths) < 0.1
+
+
+def test_a_quarter_is_held_out():
+    u = drive()
+    data = record(u, exact(u))
+    assert held_out_begin(data) == HALF == round((1 - HELD_OUT) * SAMPLES)
+    seen = seen_part(data)
+    np.testing.assert_array_equal(seen.y, data.y[:HALF])
+    np.testing.assert_array_equal(seen.u, data.u[:HALF])
+    assert (seen.inputs, seen.outputs, seen.hold, seen.name) == (
+        data.inputs,
+        data.outputs,
+        data.hold,
+        data.name,
+    )
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
+    """Its run goes on from the last window that was fitted, or begins anew in every window."""
+    u = drive(4 * SAMPLES)
+    y, level = colored(exact(u), 0)
+    frozen = of._replace(tolerance=np.full(9, FIXED))
+    data = record(u, y[:, :2], kinds=((0, ""), (1, "")))
+    noise = known(np.append(level[:2], np.nan))
+    found = left_of(refitted(frozen, Hypothesis()), frozen, [data], windowed=windowed)
+    (left,), (measured,) = found
+    assert left.shape == measured.shape == (SAMPLES, 3)
+    assert np.isnan(left[:, 2]).all()
+    np.testing.assert_array_equal(measured[:, :2], y[-SAMPLES:, :2])
+    rms = np.sqrt((left[:, :2] ** 2).mean(axis=0)) / noise.rms()[:2]
+    np.testing.assert_allclose(rms, 1, atol=0.1)
+
+
+def test_windows_begin_anew():
+    """With springs 5 % off a run through all of the held-out samples leaves more than windows do."""
+    u = drive(4 * SAMPLES)
+    y, level = colored(exact(u), 0)
+    wrong = bench(y[:SAMPLES], level, u=u[:SAMPLES], model=chain(factor=1.05))
+    frozen = wrong._replace(tolerance=np.full(9, FIXED))
+    found = refitted(frozen, Hypothesis())
+    given = found, frozen, [record(u, y)]
+    free, windows = (np.sqrt((left_of(*given, windowed=x).left[0] ** 2).mean(axis=0)) for x in (False, True))
+    assert (windows < 0.98 * free).all()
+    assert (windows > 2 * known(level).rms()).all()
