@@ -117,7 +117,7 @@ def causes_of(
     chosen = before if before is not None else rounds[0].without
     linear = refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))))
     if found.finding == "parameters" and _beyond(linear, chosen, rounds[-1].scale):
-        chosen, selected = linear, []
+        chosen, selected, look = linear, [], _Look(found.fit, found.null, None)
     say("how far the gap shrinks")
     # what is left is noise where tests find nothing in it; else it may be less
     floor = noises if look.clear else found.noises
@@ -136,7 +136,7 @@ def causes_of(
         steps[-1],
         floor,
         look.null,
-        look.scored,
+        None if look.clear else look.scored,
         ends,
     )
 

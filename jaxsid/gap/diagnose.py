@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsid.checks import require
 from jaxsid.gap.causes import Causes, causes_of
-from jaxsid.gap.closure import Closure, held_out_begin, seen_part
+from jaxsid.gap.closure import Closure, seen_part
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.explain import (
     ERRORS,
@@ -21,7 +21,6 @@ from jaxsid.gap.explain import (
 )
 from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.refit import Refit
-from jaxsid.gap.spectra import FEWEST
 from jaxsid.gap.verdict import Verdict, as_pair, plain_place, verdict_of
 from jaxsid.gap.words import next_experiment, remaining, summary
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -250,18 +249,13 @@ def diagnose(
     """
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
     records = (records,) if isinstance(records, Record) else tuple(records)
-    seen = tuple(seen_part(r) for r in records) if all(_long(r) for r in records) else records
+    seen = tuple(seen_part(r) for r in records)
     found = examine(model, seen, progress=progress)
     causes = (
         causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
     )
     said = _warnings(model, seen, found, initial == "rest")
     return Diagnosis(model, records, found, causes, verdict_of(found, causes), said)
-
-
-def _long(record: Record) -> bool:
-    """Whether enough is left of a record when its end is held out."""
-    return held_out_begin(record) >= FEWEST and len(record.y) - held_out_begin(record) >= FEWEST
 
 
 def _warnings(

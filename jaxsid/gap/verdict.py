@@ -41,7 +41,8 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         some = 0.5 * math.exp(-doubt / 0.05)
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     if found.finding == "structure" and not causes.selected and _slight(found):
-        return Verdict("none", {"none": 0.5, "effect": 0.25, "unknown": 0.25}, ())
+        some = float(sum(x.probability for x in causes.rounds[0].ranked))
+        return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     unexplained = _unexplained(causes)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
