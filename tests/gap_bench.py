@@ -85,9 +85,8 @@ def windows_of(block):
     return u, np.asarray(block.y), np.asarray(block.weight)
 
 
-def whitened(left, weight):
-    """What is left of windows, made white; the first judged sample has none before it."""
+def whitened(left, weight, lead):
+    """What is left of windows where they judge it, made white; the record's first sample has none before it."""
     white = left - POLE * np.roll(left, 1, axis=1)
     there = (weight > 0) & (np.roll(weight, 1, axis=1) > 0)
-    there[:, 0] = False
-    return np.where(there, white * weight, 0.0)
+    return np.where(there, white * weight, 0.0)[:, lead:]

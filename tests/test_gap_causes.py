@@ -8,7 +8,7 @@ import pytest
 from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
-from jaxsid.gap.causes import WORTH, Causes, _beyond, _worth
+from jaxsid.gap.causes import OFF, WORTH, Causes, _beyond, _Found, _off, _worth
 from jaxsid.gap.closure import Closure, Left, fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
@@ -51,7 +51,7 @@ def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
     every = [
         (candidate(*kinds[i]), refit(e, squares), e) for i, e in enumerate(evidences) if not math.isnan(e)
     ]
-    return _ranked(every, refit(without), BENCH)
+    return _ranked(every, refit(without), BENCH, TEMPERATURE)
 
 
 # keys and numbers
@@ -159,7 +159,7 @@ def test_probabilities_are_tempered_evidences():
 def test_no_effect_at_all_is_an_alternative_too():
     found = ranking(0.0, without=0.0)
     assert found.ranked[0].probability == pytest.approx(0.5)
-    assert _ranked([], refit(0.0), BENCH).ranked == ()
+    assert _ranked([], refit(0.0), BENCH, TEMPERATURE).ranked == ()
 
 
 def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
@@ -173,7 +173,7 @@ def test_a_further_effect_must_be_worth_it():
     def worth(gain, less, before=3000.0):
         best, without = refit(gain, before - less), refit(0.0, before)
         one = Explanation("backlash", B12, best, gain, 1.0)
-        return _worth(Ranking((one,), without, 1.0, BENCH))
+        return _worth(Ranking((one,), without, 1.0, TEMPERATURE, BENCH))
 
     assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
     assert not worth(0.99 * WORTH * TEMPERATURE, 210.0)
@@ -181,6 +181,26 @@ def test_a_further_effect_must_be_worth_it():
     assert not worth(1e4, 15.0, before=1000.0)  # there is nothing but noise, of which less than 2 %
     assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
     assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
+
+
+def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
+    model = chain()
+    count = len(element_matrices(model).listed)
+    tolerance = np.full(count, 0.01)
+    bench = BENCH._replace(model=model, tolerance=tolerance)
+    theta = np.zeros(count + 4)
+    stiff, heavy = elements_by_key(model)[key_of("stiffness_error", B12)][0], 1
+    theta[stiff], theta[heavy], theta[0] = -0.03, 0.05, 0.9 * OFF * 0.01
+    found = refit(0.0)._replace(fit=refit(0.0).fit._replace(theta=theta))
+    at = _Found(bench, None, (), (), found)
+    named = [key_of(c.kind, c.place) for c in _off(at, gains=False)]
+    assert named == [key_of("mass_error", {"body": "b2"}), key_of("stiffness_error", B12)]
+    gains = [c.kind for c in _off(at, gains=True)]
+    assert gains == ["mass_error", "input_gain", "stiffness_error", *["sensor_gain"] * 3]
+    known = found._replace(hypothesis=Hypothesis(wrong=(heavy,)))
+    assert [c.kind for c in _off(at._replace(before=known), gains=False)] == ["stiffness_error"]
+    still = found._replace(fit=found.fit._replace(theta=0 * theta))
+    assert _off(at._replace(before=still), gains=True) == ()
 
 
 # verdicts

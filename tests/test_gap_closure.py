@@ -11,7 +11,7 @@ from jaxsid.gap import closure as module
 from jaxsid.gap.closure import HELD_OUT, Left, closure_of, fraction, held_out_begin, left_of, seen_part
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import parameter_rows
-from jaxsid.gap.refit import FIXED, Hypothesis, _shot, refitted
+from jaxsid.gap.refit import FIXED, Hypothesis, refitted, shot_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
 
@@ -29,7 +29,7 @@ def of():
 
 
 def run(of, effects, u, *, first=0, state=None, changes=0.0, substeps=2):
-    shot = _shot(of, effects)
+    shot = shot_of(of, effects)
     z = shot.coordinates.unknowns(parameter_rows(effects))
     theta = np.concatenate([np.full(9, changes), z.ravel()])
     state = np.zeros(6 + 2 * shot.slots.count) if state is None else state

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from jaxsid.gap.evidence import Force, Table, density, evidence, split, table
+from jaxsid.gap.evidence import Force, Table, density, evidence, factor_of, split, table
 
 LINES, OUTPUTS, COLUMNS, STATES = 7, 2, 3, 2
 
@@ -111,3 +111,15 @@ def test_under_jit_and_vmap():
     stacked = [jnp.stack([jnp.asarray(p[k])] * 2) for k in p]
     both = jax.jit(jax.vmap(table))(*stacked)
     np.testing.assert_allclose(both.gram[1], plain.gram, rtol=1e-10, atol=1e-10)
+
+
+def test_transients_that_are_alike_are_factored():
+    column = np.linspace(1, 2, 20)[:, None] * 1e12
+    for pair in (np.hstack([column, column]), np.hstack([column, column + 1.0])):
+        gram = pair.T @ pair
+        lower, size = (np.asarray(x) for x in factor_of(jnp.asarray(gram)))
+        whole = size[:, None] * (lower @ lower.T) * size
+        np.testing.assert_allclose(whole, gram, rtol=3e-12)
+    plain = np.array([[3.0, 1.0], [1.0, 2.0]])
+    lower, size = (np.asarray(x) for x in factor_of(jnp.asarray(plain)))
+    np.testing.assert_allclose(size[:, None] * (lower @ lower.T) * size, plain + np.eye(2), rtol=3e-12)

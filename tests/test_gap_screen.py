@@ -25,7 +25,7 @@ from jaxsid.gap.noise import noise_of
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, beside, recalibrated
 from jaxsid.gap.scoring import scores
-from jaxsid.gap.screen import _rows, lone_frequencies, screen
+from jaxsid.gap.screen import _rows, lone_frequencies, screen, unseen
 from jaxsid.gap.setting import element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import spectra_of, stacked
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -194,3 +194,18 @@ def test_lone_frequencies_are_those_of_a_sine(calm):
     left = np.random.default_rng(0).standard_normal(plain.shape) + np.sin(2 * np.pi * 31.3 * t)[:, None]
     found = lone_frequencies([given], [np.abs(np.fft.rfft(left, axis=0)) / np.sqrt(SAMPLES)])
     assert np.abs(found - 31.3).min() < 0.07
+
+
+def test_what_no_line_of_a_free_axis_shows_is_a_candidate_there():
+    free = lumped_model(
+        ("motor", "load"),
+        [1.0, 2.0],
+        [50.0],
+        [0.1],
+        connections=[Connection("shaft", ("motor", "load"))],
+        inputs=[Input("torque", "motor")],
+        sensors=[Sensor("v", "motor", "velocity")],
+    )
+    found = {(c.kind, *c.place.values()) for c in unseen(free, places_of(free))}
+    assert found == {("constant_load", "motor"), ("constant_load", "load"), ("sensor_bias", "v")}
+    assert unseen(chain(), places_of(chain())) == ()

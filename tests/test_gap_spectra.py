@@ -7,7 +7,8 @@ from gap_helpers import DT, chain, drive, exact, record
 
 from jaxsid.gap.setting import element_directions
 from jaxsid.gap.spectra import in_time, motion_under, parameter_columns, readings, spectra_of, to_lines
-from jaxsid.mechanics.lumped import Input, Sensor, lumped_model
+from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model
+from jaxsid.records import Record
 
 MIXED = ((0, "acceleration"), (1, "displacement"), (2, "velocity"))
 
@@ -102,3 +103,23 @@ def test_absent_sensors_are_marked():
     spectra = spectra_of(chain(), record(u, y))
     assert spectra.present.tolist() == [1.0, 1.0, 0.0]
     assert np.isfinite(np.asarray(spectra.y)).all()
+
+
+def test_the_line_of_a_free_axis_is_left_out_however_rounding_parts_its_poles():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(400)
+    for _ in range(20):
+        mass, spring, damper = rng.uniform(0.005, 0.2, 2), 10 ** rng.uniform(1, 4), 10 ** rng.uniform(-3, 0)
+        model = lumped_model(
+            ("motor", "load"),
+            mass,
+            [spring],
+            [damper],
+            connections=[Connection("shaft", ("motor", "load"))],
+            inputs=[Input("torque", "motor")],
+            sensors=[Sensor("v", "motor", "velocity")],
+        )
+        found = spectra_of(model, Record(u[:, None], u[:, None], 1e-3, inputs=("torque",), outputs=("v",)))
+        assert found.weight[0] == 0
+        assert (np.asarray(found.weight)[1:] > 0).all()
+        assert np.isfinite(np.asarray(found.forced)).all()

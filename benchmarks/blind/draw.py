@@ -367,6 +367,7 @@ class _Made(NamedTuple):
     std: np.ndarray
     noisy: tuple[np.ndarray, ...]
     severities: tuple[Severity, ...]
+    each: tuple[float, ...]  # gap of each effect in the first record, beside the others
 
 
 def _rated(effects: tuple[Effect, ...], setup: _Setup, samples: int) -> tuple[Effect, ...]:
@@ -405,6 +406,9 @@ def _made(
     severities = tuple(severity(setup.true, r.u, r.y, std, r.before) for r in runs)
     if case.kinds and severities[0].change > 3 * CHANGES[1] and case.kinds[0] not in ABSORBED:
         return None
+    each = tuple(_beside_others(setup, runs[0], own[0], i, std, steps) for i in range(len(effects)))
+    if min(each, default=GAPS[0]) < GAPS[0]:
+        return None
     noisy = []
     for i, run in enumerate(runs):
         u, y = run.u[run.before :], run.y[run.before :]
@@ -414,7 +418,20 @@ def _made(
             signal_of(setup.excitation, same, len(run.u), setup.true.dt, setup.band)
             noise[:, setup.loop.sensor] = fed_back * same.standard_normal(len(run.u))[run.before :]
         noisy.append(np.column_stack([u, y + noise]))
-    return _Made(tuple(runs), own, std, tuple(noisy), severities)
+    return _Made(tuple(runs), own, std, tuple(noisy), severities, each)
+
+
+def _beside_others(
+    setup: _Setup, run: _Run, effects: tuple[Effect, ...], number: int, std: np.ndarray, steps: int
+) -> float:
+    """What an effect does where the others act already: of two that act alone one may do nothing beside the other."""
+    kind = effects[number].kind
+    if len(effects) == 1:
+        return _own(severity(setup.true, run.u, run.y, std, run.before), kind)
+    others = tuple(e for i, e in enumerate(effects) if i != number)
+    with np.errstate(all="ignore"):
+        y = respond(setup.true, others, run.u, before=run.before, steps=steps).y
+    return _own(severity(setup.true, run.u, run.y, std, run.before, y), kind) if _bounded(y) else np.inf
 
 
 def _labelled(
@@ -422,7 +439,6 @@ def _labelled(
 ) -> Case:
     n = len(setup.nominal.sensors)
     alone = [_own(s.severity, s.effect.kind) for s in sized]
-    whole = alone if len(sized) != 1 else [_own(made.severities[0], sized[0].effect.kind)]
     label: dict[str, Any] = {
         "case": case.number,
         "truth": "none" if not sized else "unknown" if case.kinds[0] in OUTSIDE else "effect",
@@ -432,7 +448,7 @@ def _labelled(
                 "kinds_right": list(UNLIKE.get(e.kind, () if e.kind in OUTSIDE else (e.kind,))),
                 "place": e.place,
                 "parameters": [x[i].parameters for x in made.effects],
-                "gap": whole[i],  # of the first record where the effect is alone in it
+                "gap": made.each[i],  # in the first record, beside the others
                 "gap_alone": alone[i],
                 "target": sized[i].target,
             }

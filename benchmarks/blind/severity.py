@@ -49,7 +49,14 @@ def linear_responses(systems: list[System], u: np.ndarray, starts: np.ndarray) -
     return np.einsum("psi,tpi->pts", C, states) + D[:, None, :] * u[None, :, None]
 
 
-def severity(system: System, u: np.ndarray, y: np.ndarray, std: np.ndarray, before: int) -> Severity:
+def severity(
+    system: System,
+    u: np.ndarray,
+    y: np.ndarray,
+    std: np.ndarray,
+    before: int,
+    without: np.ndarray | None = None,
+) -> Severity:
     """Of effects, from a motion with them.
 
     Args:
@@ -58,6 +65,7 @@ def severity(system: System, u: np.ndarray, y: np.ndarray, std: np.ndarray, befo
         y: (before + samples, sensors) readings with the effects, without noise.
         std: (sensors,) of the noise.
         before: samples ahead of the record.
+        without: (before + samples, sensors) readings without them; those of the linear system where left out.
     """
     values = numbers(system)
     at = np.flatnonzero(values)
@@ -67,9 +75,10 @@ def severity(system: System, u: np.ndarray, y: np.ndarray, std: np.ndarray, befo
     free = linear_responses([system] * n, 0 * u[before:], np.eye(n))
     columns = np.concatenate([(found[1:] - found[0]) / CHANGE, free])
     own = y[before:]
-    gap = (own - found[0]) / std
+    other = found[0] if without is None else without[before:]
+    gap = (own - other) / std
     J = (columns / std).reshape(len(columns), -1).T
     J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     left = gap.ravel() - J @ np.linalg.lstsq(J, gap.ravel(), rcond=1e-10)[0]
     rms = lambda x: float(np.sqrt(np.mean(np.square(x))))  # noqa: E731
-    return Severity(rms(gap), rms(left), rms((own - found[0]) / own.std(axis=0)))
+    return Severity(rms(gap), rms(left), rms((own - other) / own.std(axis=0)))

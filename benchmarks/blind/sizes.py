@@ -13,6 +13,11 @@ LIMITS = {
     "damping_error": (0.35, 6.0),
     "sensor_gain": (0.03, 0.5),
     "input_gain": (0.03, 0.5),
+    # less is nothing but a sample late where an input jumps at a sampling instant
+    "sensor_delay": (0.02, 5.0),
+    "sensor_lag": (0.02, 5.0),
+    "input_delay": (0.02, 5.0),
+    "actuator_lag": (0.02, 5.0),
     "actuator_saturation": (0.02, 0.85),
     "end_stop": (0.02, 0.9),
     "impacts": (0.02, 0.8),

@@ -8,25 +8,37 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
+from jaxsid.gap.deflate import deflated
 from jaxsid.gap.examine import NEGLIGIBLE, SIGNIFICANT, Examination
-from jaxsid.gap.explain import TEMPERATURE, Explanation, Ranking, rank
-from jaxsid.gap.free_run import free_run
+from jaxsid.gap.explain import (
+    ERRORS,
+    FIRST,
+    FURTHER,
+    NUMBERS,
+    Effort,
+    Explanation,
+    Ranking,
+    element_place,
+    elements_by_key,
+    key_of,
+    rank,
+)
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
-from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, plain_shot, refitted
-from jaxsid.gap.screen import Candidate, screen
+from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, refitted
+from jaxsid.gap.screen import Candidate, screen, unseen
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 3.0  # tempered gain of evidence from which on a further effect is taken
+OFF = 2.5  # tolerances from which on a number may be wrong
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.02  # and of all that is left
 
@@ -70,7 +82,7 @@ class _Look(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        return self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE
+        return bool(self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE)
 
 
 def causes_of(
@@ -91,43 +103,39 @@ def causes_of(
         progress: called with a line of text as each stage begins.
     """
     say = progress or (lambda text: None)
-    noises = found.noises
     say("kinds of effects")
-    bench = bench_of(model, seen, noises, found.fit)
-    look = _Look(found.fit, found.null, found.scored)
-    rounds: list[Ranking] = []
-    selected: list[Explanation] = []
-    before: Refit | None = None
-    first = candidates = _candidates(look)
-    while len(selected) < MOST_EFFECTS:
-        ranking = rank(bench, candidates, before, say)
-        rounds.append(ranking)
-        bench, noises = ranking.bench, ranking.bench.noises
-        if not ranking.ranked or not _worth(ranking):
-            break
-        best = ranking.ranked[0]
-        selected.append(best)
-        before = best.refit
-        say("what is left")
-        look = _looked(model, seen, noises, bench, before)
-        if look.clear or look.scored is None:
-            break
-        # what came next to the first effect, in turn with what now comes first
-        candidates = tuple(c for pair in zip(_candidates(look), first[1:], strict=False) for c in pair)
-    chosen = before if before is not None else rounds[0].without
-    linear = refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))))
-    if found.finding == "parameters" and _beyond(linear, chosen, rounds[-1].scale):
-        chosen, selected, look = linear, [], _Look(found.fit, found.null, None)
+    start = _Found(
+        bench_of(model, seen, found.noises, found.fit),
+        _Look(found.fit, found.null, found.scored),
+        (),
+        (),
+        None,
+    )
+    if found.finding == "structure":
+        at = _effects(start, model, seen, say)
+    else:
+        values, nominal = np.asarray(found.elements.values), np.asarray(found.elements.nominal)
+        change = np.where(nominal != 0, values / np.where(nominal != 0, nominal, 1.0) - 1, 0.0)
+        within = refitted(start.bench, Hypothesis(), changes=change)
+        at = start._replace(before=within, look=start.look._replace(scored=None))
+    at = _numbers(at, model, seen, say, gains=found.finding == "parameters")
+    bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
+    chosen = at.before if at.before is not None else rounds[0].without
+    linear = refitted(
+        bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=_start_of(chosen, bench)
+    )
+    if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
+        chosen, selected = linear, []
     say("how far the gap shrinks")
     # what is left is noise where tests find nothing in it; else it may be less
-    floor = noises if look.clear else found.noises
+    floor = bench.noises if look.clear else found.noises
     lefts = partial(left_of, bench=bench, records=whole, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
     return Causes(
-        tuple(rounds),
+        rounds,
         chosen,
         tuple(selected),
         rounds[0].without,
@@ -141,6 +149,127 @@ def causes_of(
     )
 
 
+class _Found(NamedTuple):
+    """How far the search has come: what is there, the rounds in which it was found, the fit; None before the first."""
+
+    bench: Bench
+    look: _Look
+    rounds: tuple[Ranking, ...]
+    selected: tuple[Explanation, ...]
+    before: Refit | None
+
+    def taken(self, ranking: Ranking) -> "_Found":
+        """With the best of a round."""
+        best = ranking.ranked[0]
+        rounds = (*self.rounds[: len(self.selected)], ranking)
+        return _Found(ranking.bench, self.look, rounds, (*self.selected, best), best.refit)
+
+    def refused(self, ranking: Ranking) -> "_Found":
+        """Without; a round in which nothing was found is of interest where there is no other."""
+        return self._replace(bench=ranking.bench, rounds=self.rounds or (ranking,))
+
+
+def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
+    """Effects one after another, and of those the ones that are needed still."""
+    assert at.look.scored is not None
+    # on a free axis lines do not show what is steady, and little is right without it
+    steady = unseen(at.bench.model, at.look.scored.places)
+    at = _further(at, steady, FIRST, model, seen, say) if steady else at
+    begun = len(at.selected)
+    most, first = MOST_EFFECTS + begun, _candidates(at.look)
+    candidates, before = first, begun - 1
+    while before < len(at.selected) < most and candidates:
+        before = len(at.selected)
+        at = _further(at, candidates, FURTHER if before > begun else FIRST, model, seen, say)
+        # what came next to the first effect, in turn with what now comes first
+        candidates = tuple(c for pair in zip(_candidates(at.look), first[1:], strict=False) for c in pair)
+    return _needed(at, model, seen, say)
+
+
+def _further(
+    at: _Found,
+    candidates: tuple[Candidate, ...],
+    effort: Effort,
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> _Found:
+    """With one effect more, if any is worth it, and what is left then."""
+    ranking = rank(at.bench, candidates, at.before, effort, say)
+    if not ranking.ranked or not _worth(ranking):
+        return at.refused(ranking)
+    say("what is left")
+    at = at.taken(ranking)
+    return at._replace(look=_looked(model, seen, at))
+
+
+def _needed(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
+    """Without the effects that those found later have made needless."""
+    for x in at.selected[:-1]:
+        before, last = at.before, at.rounds[-1]
+        assert before is not None
+        effects = tuple(e for e in before.hypothesis.effects if key_of(e.kind, dict(e.place)) != x.key)
+        if len(effects) == len(before.hypothesis.effects):
+            continue
+        say(f"whether {x.kind} is needed")
+        without = refitted(
+            at.bench, before.hypothesis._replace(effects=effects), changes=_start_of(before, at.bench)
+        )
+        if (before.fit.evidence - without.fit.evidence) / last.scale / last.temperature > WORTH:
+            continue
+        kept = [i for i, y in enumerate(at.selected) if y.key != x.key]
+        selected = [at.selected[i] for i in kept]
+        selected[-1] = selected[-1]._replace(refit=without)
+        at = at._replace(rounds=tuple(at.rounds[i] for i in kept), selected=tuple(selected), before=without)
+        at = at._replace(look=_looked(model, seen, at))
+    return at
+
+
+def _numbers(
+    at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None], *, gains: bool
+) -> _Found:
+    """Numbers of the model that are off by more than they may be, one after another.
+
+    Args:
+        gains: whether those of signals, which numbers can stand for, are to be tried too.
+    """
+    begun = len(at.selected)
+    while len(at.selected) < MOST_EFFECTS and at.before is not None:
+        candidates = _off(at, gains)
+        if not candidates:
+            return at
+        ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
+        if ranking.gain <= WORTH:
+            at = at.refused(ranking)
+            break
+        at = at.taken(ranking)
+    if begun and len(at.selected) > begun:
+        say("what is left")
+        at = at._replace(look=_looked(model, seen, at))
+    return at
+
+
+def _off(at: _Found, gains: bool) -> tuple[Candidate, ...]:
+    """The model's numbers that its fit holds for off, farthest first, and gains."""
+    assert at.before is not None
+    bench, wrong = at.bench, at.before.hypothesis.wrong
+    model, listed = bench.model, element_matrices(bench.model).listed
+    far = np.abs(at.before.fit.theta[: len(listed)]) / bench.tolerance
+    begin = _start_of(at.before, bench)
+    new = lambda kind, place, parameters: Candidate(kind, place, parameters, begin, 0.0, np.nan, "", {})  # noqa: E731
+    rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
+    off = [x for x in rows if far[list(x)].max() > OFF and not {*x} <= {*wrong}]
+    found = [new(ERRORS[listed[i].quantity], element_place(model, listed[i]), {}) for i, *_ in off]
+    if gains:
+        found[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
+        found += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]
+    return tuple(found) if off else ()
+
+
+def _start_of(found: Refit, bench: Bench) -> np.ndarray:
+    return found.fit.theta[: len(bench.tolerance)]
+
+
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
     """Whether all of the model's numbers together explain more than the few that were singled out.
 
@@ -152,15 +281,14 @@ def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
 def _worth(ranking: Ranking) -> bool:
     """Whether the best further candidate explains much of what was left."""
     best, without = ranking.ranked[0], ranking.without.fit
-    gain = (best.evidence - without.evidence) / ranking.scale / TEMPERATURE
     above = without.squares - without.equations
     less = without.squares - best.refit.fit.squares
-    return gain > WORTH and less > max(LESS * above, LEAST * without.squares)
+    return ranking.gain > WORTH and less > max(LESS * above, LEAST * without.squares)
 
 
 def _candidates(look: _Look) -> tuple[Candidate, ...]:
     """From the longest record, and those that hold sensors which it lacks: programs are compiled for each length."""
-    if look.scored is None:
+    if look.scored is None or look.clear:
         return ()
     of, rows = (
         look.scored,
@@ -186,48 +314,16 @@ def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:
     return [i for i in range(len(lengths)) if lengths[i] in {lengths[j] for j in chosen}]
 
 
-def _looked(
-    model: LumpedModel, seen: Sequence[Record], noises: Sequence[Noise], bench: Bench, before: Refit
-) -> _Look:
+def _looked(model: LumpedModel, seen: Sequence[Record], at: _Found) -> _Look:
     """Records without what effects found do to them, beside the model with its wrong numbers put right."""
+    bench, before = at.bench, at.before
+    assert before is not None
     nominal = np.asarray(element_matrices(bench.model).nominal)
     change = np.zeros(len(nominal))
     wrong = list(before.hypothesis.wrong)
     change[wrong] = before.fit.theta[wrong]
     base = with_values(bench.model, jnp.asarray(nominal * (1 + change)))
-    records = [_deflated(r, i, bench, before) for i, r in enumerate(seen)]
-    fit = recalibrated(base, records, noises, wide=True, given=True)
+    records = [deflated(r, i, bench, before) for i, r in enumerate(seen)]
+    fit = recalibrated(base, records, bench.noises, wide=True, given=True)
     look = _Look(fit, null_test(fit, places_of(base)), None)
-    return look if look.clear else look._replace(scored=scored(base, records, noises=noises))
-
-
-def _deflated(record: Record, number: int, bench: Bench, before: Refit) -> Record:
-    """A record less what effects do to it: y - (y with effects - y without), both from the fitted initial state."""
-    if not before.hypothesis.effects:
-        return record
-    blocks = [i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number]
-    block, state = bench.blocks[blocks[0]], before.fit.states[blocks[0]][0]
-    u = np.asarray(ordered_inputs(bench.model, record)[0])
-    begin = int(block.first[0])
-    given = {"record": number, "first": begin, "substeps": bench.substeps}
-    size, elements = 2 * len(bench.model.bodies), len(bench.tolerance)
-    plain = plain_shot(bench)
-    theta = np.zeros(
-        elements + plain.coordinates.centre.size + (bench.records - 1) * len(plain.slots.parameters)
-    )
-    theta[:elements] = before.fit.theta[:elements]
-    start = np.pad(state[:size], (0, 2 * plain.slots.count))
-    common = u, block.ramps, float(record.dt)
-    change = free_run(before.shot, before.fit.theta, *common, state, **given).outputs
-    change = (change - free_run(plain, theta, *common, start, **given).outputs)[-begin:]
-    names = [s.name for s in bench.model.sensors]
-    columns = [change[:, names.index(n)] if n in names else 0.0 * change[:, 0] for n in record.outputs]
-    return Record(
-        record.u,
-        np.asarray(record.y) - np.stack(columns, axis=1),
-        record.dt,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        hold=record.hold,
-        name=record.name,
-    )
+    return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))

@@ -131,7 +131,8 @@ def _run_on(found: Refit, bench: Bench, record: Record, number: int) -> tuple[Ru
     """The motion from the last window that was fitted to the record's end, and the number of its first sample."""
     i = max(i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number)
     block = bench.blocks[i]
-    last = int(np.flatnonzero(np.any(np.asarray(block.weight) > 0, axis=(1, 2)))[-1])
+    judged = np.asarray(block.weight)[:, block.lead :] > 0
+    last = int(np.flatnonzero(judged.any(axis=(1, 2)))[-1])
     u, first = np.asarray(ordered_inputs(bench.model, record)[0]), int(block.first[last])
     given = {"record": number, "first": first, "substeps": bench.substeps}
     state = found.fit.states[i][last]

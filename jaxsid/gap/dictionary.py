@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
+from jaxsid.gap.evidence import factor_of
 from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion, Spectra, in_time, parameter_columns, readings
 from jaxsid.mechanics.amplitudes import amplitudes
@@ -136,15 +137,14 @@ class _Near:
         self.count = transients
         flat = beside.reshape(-1, beside.shape[2])
         gram = 2 * (flat.conj().T @ flat).real
-        own = gram[:transients, :transients] + jnp.eye(transients, dtype=gram.dtype)
-        self.lower = jnp.linalg.cholesky(own)
+        self.lower, self.size = factor_of(gram[:transients, :transients])
         self.half = self._halved(gram[:transients, transients:])
         self.gram = gram[transients:, transients:] - self.half.T @ self.half
         self.along = jnp.einsum("lpt,lpb->tlb", transfers.conj(), beside)
         self.square = jnp.einsum("lpt,lps->tsl", transfers.conj(), transfers)
 
     def _halved(self, rows: Array) -> Array:
-        return jax.scipy.linalg.solve_triangular(self.lower, rows, lower=True)
+        return jax.scipy.linalg.solve_triangular(self.lower, rows / self.size[:, None], lower=True)
 
     def of_each(self, signals: Mapping[str, Array]) -> dict[str, Products]:
         """Of kinds with as many columns at once, for the sake of a short program."""

@@ -15,6 +15,8 @@ from jaxtyping import Array, Complex, Float
 
 from jaxsid.gap.spectra import stacked
 
+RIDGE = 1e-12  # of a matrix with ones on its diagonal: more than its rounding
+
 
 class Force(NamedTuple):
     """Matern-3/2 processes: standard deviation and rate l, 1/s, each (hypotheses,)."""
@@ -103,12 +105,23 @@ def table(
 
 
 def _without_transients(gram: Array, log_determinant: Array, count: int) -> Table:
-    own = gram[:count, :count] + jnp.eye(count, dtype=gram.dtype)
-    lower = jnp.linalg.cholesky(own)
-    half = jax.scipy.linalg.solve_triangular(lower, gram[:count, count:], lower=True)
+    lower, size = factor_of(gram[:count, :count])
+    half = jax.scipy.linalg.solve_triangular(lower, gram[:count, count:] / size[:, None], lower=True)
     return Table(
-        gram[count:, count:] - half.T @ half, log_determinant + 2 * jnp.log(jnp.diagonal(lower)).sum()
+        gram[count:, count:] - half.T @ half,
+        log_determinant + 2 * (jnp.log(jnp.diagonal(lower)) + jnp.log(size)).sum(),
     )
+
+
+def factor_of(gram: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """Cholesky's factor L of I + gram = S L L' S, and S, which is diagonal.
+
+    Args:
+        gram: products of the columns of transients; those of a free axis' bodies are alike to the last digit.
+    """
+    one = jnp.eye(len(gram), dtype=gram.dtype)
+    size = jnp.sqrt(jnp.diagonal(gram) + 1)
+    return jnp.linalg.cholesky((gram + one) / size / size[:, None] + RIDGE * one), size
 
 
 def absorbed(

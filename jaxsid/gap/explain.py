@@ -19,23 +19,28 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
-TEMPERATURE = 20.0
-ROUGH_STEPS, ROUGH_BLOCKS = 8, 1
+TEMPERATURE = 20.0  # of effects: what no law has decides more than noise
+MILD = 4.0  # of the model's numbers, whose equations are known
+ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 4, 1  # laws of many numbers take longer to be found
+FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
-CLOSE = 60.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
+CLOSE = 20.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
 
 
 class Effort(NamedTuple):
-    """How many candidates are fitted roughly, how many thoroughly, and in how many steps at most."""
+    """How many candidates are fitted roughly, how many thoroughly, in how many steps at most; the temperature."""
 
     tried: int
     refined: int
     steps: int
+    temperature: float
 
 
-FIRST, FURTHER = Effort(10, 4, 25), Effort(8, 2, 12)  # with two effects a step costs several times as much
+# with two effects a step costs several times as much
+FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(8, 2, 12, TEMPERATURE)
+NUMBERS = Effort(12, 6, 25, MILD)
 
 
 class Explanation(NamedTuple):
@@ -67,13 +72,20 @@ class Ranking(NamedTuple):
         ranked: fitted ones.
         without: the model with what was found before, its numbers within their tolerance.
         scale: mean square in noise that the best one leaves.
+        temperature: that differences of evidence are divided by, after the scale.
         bench: that they were fitted to, the noise that of the best one where nothing else tells of it.
     """
 
     ranked: tuple[Explanation, ...]
     without: Refit
     scale: float
+    temperature: float
     bench: Bench
+
+    @property
+    def gain(self) -> float:
+        """Tempered evidence of the best one over that of none of them."""
+        return (self.ranked[0].evidence - self.without.fit.evidence) / self.scale / self.temperature
 
 
 def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
@@ -83,7 +95,7 @@ def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
         x, y: explanations.
         of: the ranking that they are in.
     """
-    return abs(x.evidence - y.evidence) / of.scale / TEMPERATURE < SAME
+    return abs(x.evidence - y.evidence) / of.scale / of.temperature < SAME
 
 
 def key_of(kind: str, place: Mapping[str, Any]) -> Key:
@@ -126,6 +138,7 @@ def rank(
     bench: Bench,
     candidates: Sequence[Candidate],
     before: Refit | None,
+    effort: Effort,
     progress: Callable[[str], None] | None = None,
 ) -> Ranking:
     """The most promising candidates fitted, with the effects found before.
@@ -133,7 +146,8 @@ def rank(
     Args:
         bench: records.
         candidates: from the screening, most promising first.
-        before: effects found so far.
+        before: what was found so far; None where each candidate brings changes of the model's numbers of its own.
+        effort: how much is fitted.
         progress: called with a line of text before each fit.
     """
     say = progress or (lambda text: None)
@@ -142,44 +156,78 @@ def rank(
     part = bench.part(ROUGH_BLOCKS)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
     rough = []
-    effort = FIRST if before is None else FURTHER
     for c in _distinct(candidates, base, errors)[: effort.tried]:
         say(f"{c.kind} at {_label(c.place)}")
         hypothesis = extended(base, c, errors)
         start = _changes(before, bench, c.changes)
-        rough.append((c, refitted(part, hypothesis, changes=start, steps=ROUGH_STEPS)))
-    rough.sort(key=lambda x: -x[1].fit.evidence)
+        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
+        rough.append((c, refitted(part, hypothesis, changes=start, steps=steps, gain=FINE)))
+    rough.sort(key=lambda x: -_value(x[1], bench))
     ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
-    top = rough[0][1].fit.evidence if rough else 0.0
+    top = _value(rough[0][1], bench) if rough else 0.0
     if rough and any(n.degrees <= 0 for n in bench.noises):
         say("level and colour of the noise")
+        first = rough[0][1]
         best = refitted(
-            bench, rough[0][1].hypothesis, changes=_elements(rough[0][1], bench), steps=effort.steps
+            bench, first.hypothesis, changes=_elements(first, bench), steps=effort.steps, gain=FINE
         )
         bench = weighed_anew(bench, best)
         without = refitted(bench, base, changes=_elements(without, bench), states=without.fit.states)
         ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
-    found = []
-    for i, (c, r) in enumerate(rough):
-        near = (top - r.fit.evidence) / scale / TEMPERATURE < CLOSE
-        if i < effort.refined and near:
-            say(f"{c.kind} at {_label(c.place)}, thoroughly")
-            r = refitted(bench, r.hypothesis, changes=_elements(r, bench), steps=effort.steps)
-            found.append((c, r, r.fit.evidence))
-        else:
-            found.append((c, r, math.nan))
-    best = max((e for _, _, e in found if not math.isnan(e)), default=0.0)
-    every = [(c, r, best - ratio * (top - r.fit.evidence) if math.isnan(e) else e) for c, r, e in found]
-    return _ranked(every, without, bench)
+    done: dict[int, Refit] = {}
+
+    def thoroughly(i: int) -> None:
+        c, r = rough[i]
+        say(f"{c.kind} at {_label(c.place)}, thoroughly")
+        done[i] = refitted(bench, r.hypothesis, changes=_elements(r, bench), steps=effort.steps, gain=FINE)
+
+    for i, (_, r) in enumerate(rough[: effort.refined]):
+        if (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
+            thoroughly(i)
+    # what was fitted roughly is not to come first
+    while (values := _values(rough, done, bench, ratio)) and (i := int(np.argmax(values))) not in done:
+        if not math.isfinite(values[i]):
+            break
+        thoroughly(i)
+    last = dict(enumerate(r for _, r in rough)) | done
+    every = [(c, last[i], values[i]) for i, (c, _) in enumerate(rough)]
+    return _ranked(every, without, bench, effort.temperature)
 
 
-def _sensible(found: Refit) -> bool:
-    """Whether each law has parameters that it is meant for."""
+def _values(
+    rough: list[tuple[Candidate, Refit]], done: Mapping[int, Refit], bench: Bench, ratio: float
+) -> list[float]:
+    """Evidence of thorough fits; of the others what their rough ones lack to the best of those."""
+    own = {i: _value(r, bench) for i, r in done.items()}
+    best = max(own, key=lambda i: own[i], default=0)
+    top, level = _value(rough[best][1], bench), own.get(best, 0.0)
+    if not math.isfinite(level):
+        top, level = max(_value(r, bench) for _, r in rough), 0.0
+    every = (own.get(i, level - ratio * (top - _value(r, bench))) for i, (_, r) in enumerate(rough))
+    return [x if math.isfinite(x) else -math.inf for x in every]
+
+
+def _value(found: Refit, bench: Bench) -> float:
+    """Evidence; none of what makes no sense."""
+    return found.fit.evidence if _sensible(found, bench) else -math.inf
+
+
+def _sensible(found: Refit, bench: Bench) -> bool:
+    """Whether each law has parameters that it is meant for, and that windows can tell.
+
+    A mode that is slower than a window is a force of its own in each, which explains anything.
+    """
+    block = bench.blocks[0] if bench.blocks else None
     for effect in found.hypothesis.effects:
         kind = CATALOGUE[effect.kind]
-        values = (float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters)
-        if kind.sensible is not None and not kind.sensible(*values):
+        values = {p.name: float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters}
+        if kind.sensible is not None and not kind.sensible(*values.values()):
+            return False
+        if kind.vibrates is None or block is None:
+            continue
+        lasts = float(block.dt) * (block.y.shape[1] - block.lead)
+        if kind.vibrates(*values.values()) * lasts < 2 * math.pi:
             return False
     return True
 
@@ -188,12 +236,13 @@ def _elements(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
     return found.fit.theta[: len(bench.tolerance)]
 
 
-def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench) -> Ranking:
-    every = [(c, r, e if _sensible(r) else -math.inf) for c, r, e in every]
+def _ranked(
+    every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench, temperature: float
+) -> Ranking:
     every = sorted(every, key=lambda x: -x[2])
     first = every[0][1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
-    values = np.array([e for _, _, e in every] + [without.fit.evidence]) / scale / TEMPERATURE
+    values = np.array([e for _, _, e in every] + [without.fit.evidence]) / scale / temperature
     weights = np.exp(values - values.max())
     weights = weights / weights.sum()
     return Ranking(
@@ -203,6 +252,7 @@ def _ranked(every: list[tuple[Candidate, Refit, float]], without: Refit, bench: 
         ),
         without,
         scale,
+        temperature,
         bench,
     )
 

@@ -3,13 +3,14 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
 from jaxsid.compilation import compiled
-from jaxsid.gap.evidence import Force, Table, density, split, table
+from jaxsid.gap.evidence import Force, Table, density, factor_of, split, table
 from jaxsid.gap.places import Place, joint_of
 from jaxsid.gap.setting import Setting
 from jaxsid.gap.signals import Extent, extent, shapes, signals
@@ -202,5 +203,6 @@ def _cleared(given: Setting, plain: Array, variance: Array, rest: Array) -> tupl
     along = along / jnp.sqrt(1 + variance * square)[:, None]
     both = [x.reshape(-1, count + 1) for x in (along, beside)]
     gram = 2 * ((both[0].conj().T @ both[0]).real + (both[1].conj().T @ both[1]).real)
-    found = jnp.linalg.solve(gram[:count, :count] + jnp.eye(count, dtype=gram.dtype), gram[:count, count])
+    lower, size = factor_of(gram[:count, :count])
+    found = jax.scipy.linalg.cho_solve((lower, True), gram[:count, count] / size) / size
     return given.transient * found, rest - given.spectra.free @ (given.transient * found)

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.compilation import compiled
-from jaxsid.gap.evidence import table
+from jaxsid.gap.evidence import factor_of, table
 from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import Motion, in_time, motion_under, parameter_columns, spectra_of
@@ -218,8 +219,9 @@ def beside(given: Setting) -> Linear:
     left = spectra.y - spectra.response
     flat = lambda x: (x * given.scale[:, :, None]).reshape(-1, x.shape[2])  # noqa: E731
     columns, target = flat(spectra.free * given.transient), flat(left[:, :, None])
-    gram = 2 * (columns.conj().T @ columns).real + jnp.eye(columns.shape[1], dtype=columns.real.dtype)
-    state = given.transient * jnp.linalg.solve(gram, 2 * (columns.conj().T @ target[:, 0]).real)
+    lower, scale = factor_of(2 * (columns.conj().T @ columns).real)
+    state = jax.scipy.linalg.cho_solve((lower, True), 2 * (columns.conj().T @ target[:, 0]).real / scale)
+    state = given.transient * state / scale
     size = spectra.linear.mass.shape[0]
     motion = motion_under(spectra, jnp.zeros((len(left), size), left.dtype), state)
     both = jnp.concatenate([parameter_columns(spectra, motion, given.directions), left[:, :, None]], axis=2)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxsid.gap.hypothesis import (
     Moved,
@@ -20,10 +20,10 @@ from jaxsid.gap.hypothesis import (
 from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
-from jaxsid.gap.shooting import STEPS, Fit, Prior, Shot, fitted, parameters_of, products
+from jaxsid.gap.shooting import GAIN, STEPS, Fit, Prior, Products, Shot, fitted, parameters_of, products
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
-from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Effect, LumpedModel, free_bodies, second_order
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -124,7 +124,8 @@ def bench_of(
     dt = min(float(r.dt) for r in records)
     longest = max(len(r.y) for r in records)
     # small disturbing forces drive a free axis away from any long simulation
-    length = SHORTEST if free_bodies(model).shape[1] else window_length(slowest_rate(model), dt, longest)
+    free = free_bodies(model).shape[1] > 0
+    length = SHORTEST if free else window_length(slowest_rate(model), dt, longest)
     blocks = blocks_of(model, records, noises, length)
     motions = [
         np.asarray(in_time(s.spectra, x.motion.states))
@@ -178,7 +179,7 @@ def weighed_anew(bench: Bench, found: Refit) -> Bench:
         bench: records.
         found: a fit to all of it.
     """
-    lefts = [np.asarray(x) for x in left_in_windows(bench, found)]
+    lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
     noises, blocks = list(bench.noises), list(bench.blocks)
     for number, noise in enumerate(bench.noises):
         own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
@@ -199,8 +200,8 @@ def weighed_anew(bench: Bench, found: Refit) -> Bench:
     return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
 
 
-def left_in_windows(bench: Bench, found: Refit) -> list[Array]:
-    """What a fit leaves of every block, simulated less measured.
+def in_windows(bench: Bench, found: Refit) -> list[Products]:
+    """What a fit leaves of every block, and the forces there.
 
     Args:
         bench: that it was fitted to.
@@ -208,7 +209,7 @@ def left_in_windows(bench: Bench, found: Refit) -> list[Array]:
     """
     theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
     return [
-        products(found.shot, block, theta, jnp.asarray(states), substeps).left
+        products(found.shot, block, theta, jnp.asarray(states), substeps)
         for block, states in zip(bench.blocks, found.fit.states, strict=True)
     ]
 
@@ -225,6 +226,7 @@ def refitted(
     changes: Float[np.ndarray, " e"] | None = None,
     states: Sequence[np.ndarray] | None = None,
     steps: int = STEPS,
+    gain: float = GAIN,
 ) -> Refit:
     """A hypothesis fitted to a bench.
 
@@ -234,9 +236,10 @@ def refitted(
         changes: of elements to begin with; none where left out.
         states: of every block, hidden ones too, to begin with; else those of the best linear model.
         steps: most evaluations.
+        gain: of the search, below which it has come to an end.
     """
     effects = hypothesis.effects
-    shot = _shot(bench, effects)
+    shot = shot_of(bench, effects)
     slots = shot.slots
     z = shot.coordinates.unknowns(parameter_rows(effects))
     prior = _prior(bench, hypothesis, shot)
@@ -244,21 +247,23 @@ def refitted(
     theta = np.concatenate([start, z.ravel(), np.zeros((bench.records - 1) * len(z))])
     own = 2 * slots.count
     given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
-    fit = fitted(
-        shot, bench.blocks, prior, np.maximum(theta, prior.least), given, substeps=bench.substeps, steps=steps
-    )
+    # all but laws is integrated exactly
+    laws = any(sort_of(CATALOGUE[e.kind]) != "linear" for e in effects)
+    search = {"substeps": bench.substeps if laws else 1, "steps": steps, "gain": gain}
+    fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, **search)
     return _concluded(bench, hypothesis, shot, fit)
 
 
-def _shot(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
+def shot_of(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
+    """The model with effects, ready to be simulated.
+
+    Args:
+        bench: its records tell how the bodies move.
+        effects: kinds and places.
+    """
     linear, slots = second_order(bench.model), effect_slots(bench.model, effects)
     coordinates = coordinates_of(effects, amplitudes_of(linear, slots, bench.moved))
     return Shot(linear, element_directions(bench.model), slots, coordinates)
-
-
-def plain_shot(bench: Bench) -> Shot:
-    """The model without any effect, ready to be simulated."""
-    return _shot(bench, ())
 
 
 def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:

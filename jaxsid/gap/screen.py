@@ -26,8 +26,9 @@ from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS
 from jaxsid.mechanics.effects.prior import Amplitudes
-from jaxsid.mechanics.lumped import GROUND, LumpedModel, second_order
+from jaxsid.mechanics.lumped import GROUND, LumpedModel, free_bodies, second_order
 from jaxsid.mechanics.slots import Slots, nominal_at
+from jaxsid.physical.elements import element_matrices
 
 FREQUENCIES = 15  # tried for a disturbance
 BESIDE = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a line, in lines: where between them a frequency may lie
@@ -91,7 +92,7 @@ def screen(
         kinds: which to try; None for all.
 
     Returns:
-        Candidates by their best rank on any motion, then by evidence.
+        Candidates by their best rank on any motion, then by evidence; see `unseen` for those that no line shows.
     """
     require(len(motions) > 0, "give at least one motion.")
     tried = tuple(CATALOGUE) if kinds is None else tuple(kinds)
@@ -103,6 +104,27 @@ def screen(
         order = sorted(each, key=lambda c: -c.evidence)
         found[name] = [c._replace(motion=name, ranks={name: i + 1}) for i, c in enumerate(order)]
     return _united(found)
+
+
+def unseen(model: LumpedModel, places: tuple[Place, ...]) -> tuple[Candidate, ...]:
+    """What is the same at all times, on a free axis: its line of zero frequency is that of the axis itself.
+
+    Args:
+        model: nominal.
+        places: from `places_of`.
+
+    Returns:
+        Candidates whose evidence nothing is known of, 0; none where every body is held.
+    """
+    if free_bodies(model).shape[1] == 0:
+        return ()
+    steady = {n: k for n, k in CATALOGUE.items() if k.steady}
+    nothing = np.zeros(len(element_matrices(model).listed))
+    return tuple(
+        Candidate(name, place, {p.name: 0.0 for p in kind.parameters}, nothing, 0.0, math.nan, "", {})
+        for name, kind in steady.items()
+        for place in _rows(model, places, kind.where).named
+    )
 
 
 def _united(found: Mapping[str, list[Candidate]]) -> tuple[Candidate, ...]:
@@ -210,8 +232,12 @@ def _candidate(
         if not beyond.any():
             break
         prior[:, :k][beyond] = 0.0
-    value = np.where(prior[:, :k].any(axis=1), found.value[:, 0, 0], -np.inf)
+    value = np.where(
+        prior[:, :k].any(axis=1) & np.isfinite(found.value[:, 0, 0]), found.value[:, 0, 0], -np.inf
+    )
     best = int(value.argmax())
+    if not np.isfinite(value[best]):
+        return None
     c = coefficients[best]
     left = about[best, -1, -1] - 2 * c @ about[best, :-1, -1] + c @ about[best, :-1, :-1] @ c
     parameters = parameters_of(name, grid, place, best, np.where(prior[best, :k] > 0, own[best], 0.0))

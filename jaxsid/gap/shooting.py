@@ -13,19 +13,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
 from jaxsid.mechanics.augmented import augmented
-from jaxsid.mechanics.nonlinear import forced, respond_to
+from jaxsid.mechanics.nonlinear import Response, forced, respond_to
 from jaxsid.mechanics.slots import Slots
 from jaxsid.physical.motion import counted
 from jaxsid.records import SecondOrderModel
 
 STEPS = 25  # of the search
-GAIN = 0.05  # of the cost: a helpful step that brings less ends it
+GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that brings less ends it
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
@@ -53,11 +53,15 @@ class Products(NamedTuple):
 
     Attributes:
         gram: (windows, p + n + 1, p + n + 1).
+        equations: (windows,) entries of the residual that count.
         left: (windows, lead + length, outputs) simulated less measured.
+        forces: (windows, lead + length, slots) of each effect.
     """
 
     gram: Float[Array, "windows q q"]
+    equations: Int[Array, " windows"]
     left: Float[Array, "windows length outputs"]
+    forces: Float[Array, "windows length slots"]
 
 
 class Fit(NamedTuple):
@@ -115,16 +119,18 @@ def products(shot: Shot, block: Block, theta: Array, states: Array, substeps: Ar
     p, n = len(theta), states.shape[1]
 
     def window(u: Array, y: Array, weight: Array, taps: Array, first: Array, record: Array, state: Array):
-        def residual(move: Array) -> tuple[Array, tuple[Array, Array]]:
-            of_record = parameters_of(shot, theta + move[:p], record)
-            outputs = _outputs(shot, theta + move[:p], of_record, state + move[p:], u, first, block, substeps)
-            left = outputs - y
-            r = _white(left, weight, taps)
-            return r, (left, r)
+        counts = counted(weight[None], taps)[0][block.lead :]
 
-        slopes, (left, r) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(p + n, theta.dtype))
+        def residual(move: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+            of_record = parameters_of(shot, theta + move[:p], record)
+            found = _response(shot, theta + move[:p], of_record, state + move[p:], u, first, block, substeps)
+            left = found.outputs - y
+            r = (counts * _white(left, weight, taps)[block.lead :]).ravel()
+            return r, (r, left, found.forces)
+
+        slopes, (r, left, forces) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(p + n, theta.dtype))
         rows = jnp.concatenate([slopes, r[:, None]], axis=1)
-        return Products(rows.T @ rows, left)
+        return Products(rows.T @ rows, (counts > 0).sum(), left, forces)
 
     parts = block.u, block.y, block.weight, block.taps, block.first, block.record, states
     return jax.vmap(window)(*parts)
@@ -162,7 +168,7 @@ def matrices_of(shot: Shot, theta: Array) -> SecondOrderModel:
     return eqx.tree_at(lambda s: (s.mass, s.damping, s.stiffness), linear, tuple(moved))
 
 
-def _outputs(
+def _response(
     shot: Shot,
     theta: Array,
     parameters: Array,
@@ -171,20 +177,19 @@ def _outputs(
     first: Array,
     block: Block,
     substeps: Array,
-) -> Float[Array, "length outputs"]:
+) -> Response:
     slots = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters)
     # the linear part does not depend on phases: one for all records
     common = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters_of(shot, theta, 0))
     system = augmented(matrices_of(shot, theta), common)
     late = forced(system, common, u, block.ramps, block.dt)
     late = eqx.tree_at(lambda x: x[:4], late, tuple(x[block.lead :] for x in late[:4]))
-    return respond_to(system, slots, late, block.dt, state, substeps, first).outputs
+    return respond_to(system, slots, late, block.dt, state, substeps, first)
 
 
-def _white(left: Array, weight: Array, taps: Array) -> Float[Array, " rows"]:
+def _white(left: Array, weight: Array, taps: Array) -> Float[Array, "length outputs"]:
     r = jnp.where(weight > 0, left, 0.0)
-    white = sum(taps[:, k] * jnp.roll(r, k, axis=0) for k in range(taps.shape[1]))
-    return (white * counted(weight[None], taps)[0]).ravel()
+    return jnp.stack([taps[:, k] * jnp.roll(r, k, axis=0) for k in range(taps.shape[1])]).sum(axis=0)
 
 
 def fitted(
@@ -196,6 +201,7 @@ def fitted(
     *,
     substeps: int,
     steps: int = STEPS,
+    gain: float = GAIN,
 ) -> Fit:
     """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated window by
     window.
@@ -208,6 +214,7 @@ def fitted(
         states: likewise, of each block.
         substeps: steps for each sampling interval.
         steps: most evaluations.
+        gain: of the cost, in mean squares of what is left, below which a helpful step is the last.
     """
     at = _evaluated(shot, blocks, prior, theta, list(states), substeps)
     damping, growth, settled, done = DAMPING, 2.0, False, 1
@@ -218,10 +225,10 @@ def fitted(
             shot, blocks, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
         )
         done += 1
-        gain = at.cost - found.cost
-        if gain > 0:
+        less = at.cost - found.cost
+        if less > 0:
             at, damping, growth = found, max(damping / 5, 1e-9), 2.0
-            if gain < GAIN + PART * abs(found.cost):
+            if less < gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost):
                 settled = True
                 break
         else:
@@ -229,17 +236,18 @@ def fitted(
             if damping > MOST_DAMPING:
                 settled = True
                 break
-    return _concluded(at, blocks, prior, done, settled)
+    return _concluded(at, prior, done, settled)
 
 
 class _At(NamedTuple):
-    """A point of the search: unknowns, states, cost, its squares, gram (windows, q, q) of all windows."""
+    """A point of the search: unknowns, states, cost, its squares, gram (windows, q, q) and equations of all windows."""
 
     theta: np.ndarray
     states: list[np.ndarray]
     cost: float
     squares: float
     gram: np.ndarray
+    equations: int
 
 
 def _evaluated(
@@ -252,18 +260,18 @@ def _evaluated(
 ) -> _At:
     number = jnp.asarray(substeps)
     parts = [
-        np.asarray(products(shot, b, jnp.asarray(theta), jnp.asarray(s), number).gram)
+        products(shot, b, jnp.asarray(theta), jnp.asarray(s), number)
         for b, s in zip(blocks, states, strict=True)
     ]
-    gram = np.concatenate(parts)
+    gram = np.concatenate([np.asarray(x.gram) for x in parts])
+    equations = sum(int(np.asarray(x.equations).sum()) for x in parts)
     squares = float(gram[:, -1, -1].sum())
     own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (
         (np.concatenate(states) / prior.states) ** 2
     ).sum()
     cost = 0.5 * (squares + float(own))
-    return _At(
-        theta, states, cost if np.isfinite(gram).all() and np.isfinite(cost) else np.inf, squares, gram
-    )
+    fine = np.isfinite(gram).all() and np.isfinite(cost)
+    return _At(theta, states, cost if fine else np.inf, squares, gram, equations)
 
 
 def _normal(at: _At, prior: Prior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -310,7 +318,7 @@ def _log_determinant(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1])
 
 
-def _concluded(at: _At, blocks: Sequence[Block], prior: Prior, steps: int, settled: bool) -> Fit:
+def _concluded(at: _At, prior: Prior, steps: int, settled: bool) -> Fit:
     own, mixed, inner = _normal(at, prior)
     if not np.isfinite(at.cost):
         nothing = np.full((len(own), len(own)), np.nan)
@@ -318,13 +326,14 @@ def _concluded(at: _At, blocks: Sequence[Block], prior: Prior, steps: int, settl
     reduced = own - np.einsum("wnp,wnq->pq", mixed, _solved(inner, mixed))
     determinant = float(_log_determinant(reduced) + _log_determinant(inner).sum())
     determinant += 2 * float(np.log(prior.deviation).sum() + len(inner) * np.log(prior.states).sum())
+    evidence = -at.cost - 0.5 * determinant
     return Fit(
         theta=at.theta,
         states=tuple(at.states),
         squares=at.squares,
-        equations=sum(int((np.asarray(b.weight) > 0).sum()) for b in blocks),
+        equations=at.equations,
         covariance=_solved(reduced, np.eye(len(reduced))),
-        evidence=-at.cost - 0.5 * determinant,
+        evidence=evidence if np.isfinite(evidence) else -np.inf,
         steps=steps,
         settled=settled,
     )

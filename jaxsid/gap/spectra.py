@@ -26,7 +26,7 @@ from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderMode
 
 FEWEST = 64  # samples of a record
 FREE = 1e-9  # stiffness of a motion, next to the largest, below which nothing holds it
-CLEAR = 1e-9  # distance of a line from a pole, on the circle of z, from which on it is used
+CLEAR = 1e-6  # distance of a line from a pole on the circle of z from which on it is used: rounding parts double poles
 
 
 class Spectra(eqx.Module):

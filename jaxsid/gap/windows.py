@@ -28,7 +28,8 @@ class Block(eqx.Module):
     Attributes:
         u: (windows, lead + lead + length, inputs) inputs, from one lead before the window begins.
         y: (windows, lead + length, outputs) measured.
-        weight: (windows, lead + length, outputs) one over the noise's level, 0 where nothing is judged.
+        weight: (windows, lead + length, outputs) one over the noise's level, 0 where nothing was measured; what comes
+            before the window serves the filter only.
         taps: (windows, outputs, taps) of the filter that makes the noise white, the first 1.
         first: (windows,) number of the sample that a window begins at, less than 0 before the record's start.
         record: (windows,) number of the record.
@@ -109,10 +110,8 @@ def _of_record(
     y, weight = (np.pad(x, ((lead, after), (0, 0))) for x in (y, seen / level))
     starts = begin + length * np.arange(windows)
     cut = lambda x, extra: x[starts[:, None] + np.arange(length + extra)]  # noqa: E731
-    weight = cut(weight, lead)
-    weight[:, :lead] = 0.0
     taps = np.tile(noise.taps, (windows, 1, 1))
-    parts = cut(u, 2 * lead), cut(y, lead), weight, taps, starts - lead, np.full(windows, number)
+    parts = cut(u, 2 * lead), cut(y, lead), cut(weight, lead), taps, starts - lead, np.full(windows, number)
     return [
         Block(*(jnp.asarray(x[i : i + count]) for x in parts), ramps=ramps, dt=jnp.asarray(float(record.dt)))
         for i in range(0, windows, count)

@@ -127,25 +127,21 @@ def _delayed(
     """One output some sampling intervals ago, from the sample before that instant; at rest before the record."""
     back = jnp.ceil(delay)
     part = back - delay
-    at = jnp.arange(len(forces)) - back.astype(int)
-    before = jnp.clip(at, 0, len(forces) - 1)
-    after = jnp.minimum(before + 1, len(forces) - 1)
     columns = jnp.concatenate([system.G, system.B], axis=1)
     ports = system.G.shape[1]
     whole, one, two, _ = phi_columns(system.A, columns, part * dt)
     length = jnp.where(part > 0, part, 1.0)
-    value, change = jax.vmap(lambda i: line_over_step(_of_sample(late, i), jnp.zeros_like(part), length))(
-        before
-    )
-    x = path.states[before] @ whole.T + path.mean_force[before] @ one[:, :ports].T
-    x = x + value @ one[:, ports:].T + change @ two[:, ports:].T
-    arrived = (part >= late.arrival)[None]
+    lines = late._replace(arrival=None)
+    value, change = jax.vmap(
+        lambda line: line_over_step(line._replace(arrival=late.arrival), 0.0 * part, length)
+    )(lines)
+    # read so long after every sample, of which those are taken that lie far enough back
+    read = path.states @ (C @ whole) + path.mean_force @ (C @ one[:, :ports])
+    read = read + value @ (C @ one[:, ports:]) + change @ (C @ two[:, ports:])
+    arrived = part >= late.arrival
     line = late.new + (part - late.arrival) * late.new_slope
-    u = jnp.where(arrived, line, late.old + (part - late.arrival) * late.old_slope)[before]
-    f = forces[before] * (1 - part) + forces[after] * part
-    return jnp.where(at < 0, C @ path.states[0], x @ C + u @ D + f @ F)
-
-
-def _of_sample(late: Late, number: Array) -> Late:
-    old, new, old_slope, new_slope = (x[number] for x in late[:4])
-    return Late(old, new, old_slope, new_slope, late.arrival)
+    u = jnp.where(arrived, line, late.old + (part - late.arrival) * late.old_slope)
+    after = jnp.concatenate([forces[1:], forces[-1:]])
+    read = read + u @ D + (forces * (1 - part) + after * part) @ F
+    at = jnp.arange(len(forces)) - back.astype(int)
+    return jnp.where(at < 0, C @ path.states[0], read[jnp.maximum(at, 0)])

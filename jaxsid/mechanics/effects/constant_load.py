@@ -19,4 +19,5 @@ EFFECT = Kind(
     about="Weight along a tilted axis, a preload, an offset of the drive's amplifier.",
     source="A. Janot, M. Gautier and M. Brunot, Data set and reference models of EMPS, 2019.",
     force=_force,
+    steady=True,
 )

@@ -118,6 +118,8 @@ class Kind(NamedTuple):
         states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
         sensible: whether parameters, in their order, are such as the law is meant for; least values apart.
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
+        vibrates: rad/s at which a part of its own swings, from its parameters in their order.
+        steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
     """
 
     name: str
@@ -133,6 +135,8 @@ class Kind(NamedTuple):
     states: int = 0
     sensible: Callable[..., bool] | None = None
     needs: Literal["", "joined", "apart"] = ""
+    vibrates: Callable[..., float] | None = None
+    steady: bool = False
 
 
 def power(x: Array, exponent: Array) -> Array:

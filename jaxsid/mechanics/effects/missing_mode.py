@@ -1,5 +1,7 @@
 """A mass on a spring and damper that the model lacks."""
 
+import math
+
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import DAMPING, MASS, STIFFNESS, Changes, Kind, Nominal, Parameter
@@ -8,6 +10,10 @@ from jaxsid.mechanics.effects.prior import Scale, size
 
 def _changes(at: Nominal, mass: Array, stiffness: Array, damping: Array) -> Changes:
     return Changes(attached_mass=mass, attached_stiffness=stiffness, attached_damping=damping)
+
+
+def _vibrates(mass: float, stiffness: float, damping: float) -> float:
+    return math.sqrt(stiffness / mass) if mass > 0 else math.inf
 
 
 EFFECT = Kind(
@@ -23,4 +29,5 @@ EFFECT = Kind(
     source="J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, ch. 3.",
     changes=_changes,
     states=2,
+    vibrates=_vibrates,
 )

@@ -18,4 +18,5 @@ EFFECT = Kind(
     about="Drifted zero, gravity on a tilted accelerometer.",
     source="R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012.",
     changes=_changes,
+    steady=True,
 )
