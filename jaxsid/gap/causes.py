@@ -29,7 +29,7 @@ from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
-from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, refitted
+from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, refitted, weighed_anew
 from jaxsid.gap.screen import Candidate, screen, unseen
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
@@ -38,6 +38,7 @@ from jaxsid.records import Record
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 3.0  # tempered gain of evidence from which on a further effect is taken
+POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.02  # and of all that is left
@@ -159,10 +160,14 @@ class _Found(NamedTuple):
     before: Refit | None
 
     def taken(self, ranking: Ranking) -> "_Found":
-        """With the best of a round."""
-        best = ranking.ranked[0]
+        """With the best of a round, fitted to the very bottom, its noise what is left there."""
+        best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
+        for again in (False, True):
+            bench = weighed_anew(bench, last) if again else bench
+            begin = {"changes": _start_of(last, bench), "states": last.fit.states}
+            last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
         rounds = (*self.rounds[: len(self.selected)], ranking)
-        return _Found(ranking.bench, self.look, rounds, (*self.selected, best), best.refit)
+        return _Found(bench, self.look, rounds, (*self.selected, best._replace(refit=last)), last)
 
     def refused(self, ranking: Ranking) -> "_Found":
         """Without; a round in which nothing was found is of interest where there is no other."""

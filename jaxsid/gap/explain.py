@@ -19,7 +19,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
-TEMPERATURE = 20.0  # of effects: what no law has decides more than noise
+TEMPERATURE = 10.0  # of effects: what no law has decides more than noise
 MILD = 4.0  # of the model's numbers, whose equations are known
 ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 4, 1  # laws of many numbers take longer to be found
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
