@@ -368,3 +368,12 @@ def test_coulomb_friction_is_recovered():
     )
     assert abs(pull(found, "force", 3.0)) < 3
     assert found.deviations[0]["force"] < 0.1
+
+
+def test_deviations_come_from_windows_where_more_than_noise_is_left():
+    y, level = colored(truth(drive(), "cubic_stiffness", JOINT, {"coefficient": 1e6}), 2)
+    start = Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=9e5),))
+    right, wrong = (refitted(bench(y, level / part), start) for part in (1.0, 5.0))
+    assert wrong.fit.squares == pytest.approx(25 * right.fit.squares, rel=0.02)
+    true, said = (x.deviations[0]["coefficient"] for x in (right, wrong))
+    assert 0.5 * true < said < 2 * true  # and not a fifth of it

@@ -121,7 +121,8 @@ def causes_of(
         at = start._replace(before=within, look=start.look._replace(scored=None))
     at = _numbers(at, model, seen, say, gains=found.finding == "parameters")
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
-    chosen = at.before if at.before is not None else rounds[0].without
+    plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
+    chosen = plain if at.before is None else at.before
     linear = refitted(
         bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=_start_of(chosen, bench)
     )
@@ -139,7 +140,7 @@ def causes_of(
         rounds,
         chosen,
         tuple(selected),
-        rounds[0].without,
+        plain,
         linear,
         tuple(closure_of(*ends, x, floor, names) for x in steps),
         steps[-1],

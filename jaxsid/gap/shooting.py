@@ -29,6 +29,7 @@ GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
+MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 RIDGE = 1e-13  # of a matrix with ones on its diagonal: less than its rounding matters
 
 
@@ -72,7 +73,7 @@ class Fit(NamedTuple):
         states: of each block (windows, n).
         squares: sum of squares of the weighted residual.
         equations: number of them.
-        covariance: (p, p) of the unknowns.
+        covariance: (p, p) of the unknowns; where more than noise is left, from how windows differ.
         evidence: its logarithm after Laplace, up to what all hypotheses share.
         steps: of the search.
         settled: whether it came to an end by itself.
@@ -318,6 +319,25 @@ def _log_determinant(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1])
 
 
+def _covariance(
+    at: _At, prior: Prior, reduced: np.ndarray, mixed: np.ndarray, inner: np.ndarray
+) -> Float[np.ndarray, "p p"]:
+    """The inverse of the cost's second derivatives, its deviations no less than those that windows tell.
+
+    Source: H. White, Econometrica 50 (1982).
+    """
+    p = len(reduced)
+    found = _solved(reduced, np.eye(p))
+    if at.squares < MORE * max(at.equations, 1) or len(inner) < 2:
+        return found
+    slopes = at.gram[:, p:-1, -1] + np.concatenate(at.states) / prior.states**2
+    each = at.gram[:, :p, -1] - np.einsum("wnp,wn->wp", mixed, _solved(inner, slopes[:, :, None])[:, :, 0])
+    moves = (each - each.mean(axis=0)) @ found
+    told = (moves**2).sum(axis=0) * len(moves) / (len(moves) - 1)
+    larger = np.sqrt(np.maximum(told / np.maximum(np.diag(found), np.finfo(float).tiny), 1.0))
+    return found * larger * larger[:, None]
+
+
 def _concluded(at: _At, prior: Prior, steps: int, settled: bool) -> Fit:
     own, mixed, inner = _normal(at, prior)
     if not np.isfinite(at.cost):
@@ -332,7 +352,7 @@ def _concluded(at: _At, prior: Prior, steps: int, settled: bool) -> Fit:
         states=tuple(at.states),
         squares=at.squares,
         equations=at.equations,
-        covariance=_solved(reduced, np.eye(len(reduced))),
+        covariance=_covariance(at, prior, reduced, mixed, inner),
         evidence=evidence if np.isfinite(evidence) else -np.inf,
         steps=steps,
         settled=settled,

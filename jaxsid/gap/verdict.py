@@ -41,7 +41,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         some = 0.5 * math.exp(-doubt / 0.05)
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     if found.finding == "structure" and not causes.selected and _slight(found):
-        some = float(sum(x.probability for x in causes.rounds[0].ranked))
+        some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     unexplained = _unexplained(causes)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}

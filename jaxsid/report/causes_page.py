@@ -87,7 +87,10 @@ def _selected(listed: list[dict[str, Any]]) -> Block:
         return Text(
             "No kind of effect in the catalogue explains enough of the gap to be believed; the best of them follow."
         )
-    note = "Parameters ± one standard deviation of noise. Gap after: NRMSE of the worst sensor, held-out samples."
+    note = (
+        "Parameters ± one standard deviation, from how windows differ where more than noise is left; what the law "
+        "itself misses is not in it. Gap after: NRMSE of the worst sensor, held-out samples."
+    )
     header = ("Selected", "Parameters", "Law", "Gap after")
     return Table(header, tuple(_selected_row(x) for x in listed), "", note)
 
