@@ -17,6 +17,7 @@ from jaxsid.gap.explain import (
     Ranking,
     _distinct,
     _ranked,
+    _values,
     alike,
     elements_by_key,
     extended,
@@ -159,7 +160,9 @@ def test_probabilities_are_tempered_evidences():
 def test_no_effect_at_all_is_an_alternative_too():
     found = ranking(0.0, without=0.0)
     assert found.ranked[0].probability == pytest.approx(0.5)
-    assert _ranked([], refit(0.0), BENCH, TEMPERATURE).ranked == ()
+    none = _ranked([], refit(0.0), BENCH, TEMPERATURE)
+    assert (none.ranked, none.gain) == ((), 0.0)
+    assert _values([], {}, BENCH, 1.0) == []
 
 
 def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
@@ -181,6 +184,15 @@ def test_a_further_effect_must_be_worth_it():
     assert not worth(1e4, 15.0, before=1000.0)  # there is nothing but noise, of which less than 2 %
     assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
     assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
+
+
+def test_a_refused_effect_leaves_what_was_found_as_it_is():
+    first, second = ranking(0.0), ranking(1.0)
+    other = second._replace(bench=BENCH._replace(substeps=7))
+    begun = _Found(BENCH, None, (), (), None)
+    assert begun.refused(other) == begun._replace(bench=other.bench, rounds=(other,))
+    found = begun._replace(rounds=(first,), selected=first.ranked[:1])
+    assert found.refused(other) is found
 
 
 def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():

@@ -29,7 +29,7 @@ from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
-from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, refitted, weighed_anew
+from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, changes_of, refitted, weighed_anew
 from jaxsid.gap.screen import Candidate, screen, unseen
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
@@ -124,7 +124,7 @@ def causes_of(
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before
     linear = refitted(
-        bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=_start_of(chosen, bench)
+        bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=changes_of(chosen, bench)
     )
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
@@ -165,14 +165,14 @@ class _Found(NamedTuple):
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
         for again in (False, True):
             bench = weighed_anew(bench, last) if again else bench
-            begin = {"changes": _start_of(last, bench), "states": last.fit.states}
+            begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
         rounds = (*self.rounds[: len(self.selected)], ranking)
         return _Found(bench, self.look, rounds, (*self.selected, best._replace(refit=last)), last)
 
     def refused(self, ranking: Ranking) -> "_Found":
-        """Without; a round in which nothing was found is of interest where there is no other."""
-        return self._replace(bench=ranking.bench, rounds=self.rounds or (ranking,))
+        """Without; what a refused effect leaves is no noise, and its round of interest only where there is no other."""
+        return self if self.selected else self._replace(bench=ranking.bench, rounds=(ranking,))
 
 
 def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
@@ -180,7 +180,8 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     assert at.look.scored is not None
     # on a free axis lines do not show what is steady, and little is right without it
     steady = unseen(at.bench.model, at.look.scored.places)
-    at = _further(at, steady, FIRST, model, seen, say) if steady else at
+    with_steady = _further(at, steady, FIRST, model, seen, say) if steady else at
+    at = with_steady if with_steady.selected else at
     begun = len(at.selected)
     most, first = MOST_EFFECTS + begun, _candidates(at.look)
     candidates, before = first, begun - 1
@@ -219,7 +220,7 @@ def _needed(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callabl
             continue
         say(f"whether {x.kind} is needed")
         without = refitted(
-            at.bench, before.hypothesis._replace(effects=effects), changes=_start_of(before, at.bench)
+            at.bench, before.hypothesis._replace(effects=effects), changes=changes_of(before, at.bench)
         )
         if (before.fit.evidence - without.fit.evidence) / last.scale / last.temperature > WORTH:
             continue
@@ -261,7 +262,7 @@ def _off(at: _Found, gains: bool) -> tuple[Candidate, ...]:
     bench, wrong = at.bench, at.before.hypothesis.wrong
     model, listed = bench.model, element_matrices(bench.model).listed
     far = np.abs(at.before.fit.theta[: len(listed)]) / bench.tolerance
-    begin = _start_of(at.before, bench)
+    begin = changes_of(at.before, bench)
     new = lambda kind, place, parameters: Candidate(kind, place, parameters, begin, 0.0, np.nan, "", {})  # noqa: E731
     rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
     off = [x for x in rows if far[list(x)].max() > OFF and not {*x} <= {*wrong}]
@@ -270,10 +271,6 @@ def _off(at: _Found, gains: bool) -> tuple[Candidate, ...]:
         found[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
         found += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]
     return tuple(found) if off else ()
-
-
-def _start_of(found: Refit, bench: Bench) -> np.ndarray:
-    return found.fit.theta[: len(bench.tolerance)]
 
 
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:

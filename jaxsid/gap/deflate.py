@@ -42,29 +42,25 @@ def deflated(record: Record, number: int, bench: Bench, found: Refit) -> Record:
     def run(shot: Shot, theta: np.ndarray, inputs: np.ndarray, ramps: Array, state: np.ndarray) -> np.ndarray:
         return free_run(shot, theta, inputs, ramps, float(record.dt), state, **given).outputs[-begin:]
 
-    size, count = 2 * len(bench.model.bodies), len(effects)
-    state = found.fit.states[first][0]
-    hidden = state[size:].reshape(2, count)[:, kept].ravel()
-    plain, parts = shot_of(bench, ()), _without(found, bench, kept)
-    still = np.pad(state[:size], (0, 2 * plain.slots.count))
-    without = run(plain, _theta(found, bench, plain, []), u, block.ramps, still)
-    shot, theta = parts if kept else (plain, _theta(found, bench, plain, []))
+    size, state = 2 * len(bench.model.bodies), found.fit.states[first][0]
+    hidden = state[size:].reshape(2, len(effects))[:, kept].ravel()
+
+    def padded(shot: Shot, *parts: np.ndarray) -> np.ndarray:
+        joined = np.concatenate(parts)
+        return np.pad(joined, (0, size + 2 * shot.slots.count - len(joined)))
+
+    plain, rest = _part(found, bench, [])
+    without = run(plain, rest, u, block.ramps, padded(plain, state[:size]))
+    shot, theta = _part(found, bench, kept)
+    begun = padded(shot, state[:size], hidden)
     if laws:
         shot = _driven(shot, np.asarray(found.shot.slots.pushes)[laws])
         u = np.concatenate([u, _forces(number, bench, found)[: len(u), laws]], axis=1)
     ramps = jnp.concatenate([block.ramps, jnp.ones(len(laws), bool)])
-    change = run(shot, theta, u, ramps, np.concatenate([state[:size], hidden]) if kept else still) - without
+    change = run(shot, theta, u, ramps, begun) - without
     names = [s.name for s in bench.model.sensors]
     columns = [change[:, names.index(n)] if n in names else 0.0 * change[:, 0] for n in record.outputs]
-    return Record(
-        record.u,
-        np.asarray(record.y) - np.stack(columns, axis=1),
-        record.dt,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        hold=record.hold,
-        name=record.name,
-    )
+    return eqx.tree_at(lambda r: r.y, record, jnp.asarray(np.asarray(record.y) - np.stack(columns, axis=1)))
 
 
 def _forces(number: int, bench: Bench, found: Refit) -> Float[np.ndarray, "samples slots"]:
@@ -79,13 +75,9 @@ def _forces(number: int, bench: Bench, found: Refit) -> Float[np.ndarray, "sampl
     )
 
 
-def _without(found: Refit, bench: Bench, kept: list[int]) -> tuple[Shot, np.ndarray]:
+def _part(found: Refit, bench: Bench, kept: list[int]) -> tuple[Shot, np.ndarray]:
     """The hypothesis with some of its effects only, and its unknowns."""
     shot = shot_of(bench, tuple(found.hypothesis.effects[i] for i in kept))
-    return shot, _theta(found, bench, shot, kept)
-
-
-def _theta(found: Refit, bench: Bench, shot: Shot, kept: list[int]) -> np.ndarray:
     elements, slots = len(bench.tolerance), len(found.shot.slots.parameters)
     theta, rows = np.asarray(found.fit.theta), shot.slots.count
     own, further = (
@@ -95,7 +87,7 @@ def _theta(found: Refit, bench: Bench, shot: Shot, kept: list[int]) -> np.ndarra
     z = theta[elements : elements + found.shot.coordinates.centre.size].reshape(slots, -1)
     shifts = theta[elements + z.size :].reshape(-1, slots)
     own[: len(kept)], further[:, : len(kept)] = z[kept], shifts[:, kept]
-    return np.concatenate([theta[:elements], own.ravel(), further.ravel()])
+    return shot, np.concatenate([theta[:elements], own.ravel(), further.ravel()])
 
 
 def _driven(shot: Shot, pushes: Float[np.ndarray, "laws N"]) -> Shot:

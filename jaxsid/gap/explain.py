@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, refitted, weighed_anew
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted, weighed_anew
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
@@ -84,7 +84,9 @@ class Ranking(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Tempered evidence of the best one over that of none of them."""
+        """Tempered evidence of the best one over that of none of them; 0 where there is none."""
+        if not self.ranked:
+            return 0.0
         return (self.ranked[0].evidence - self.without.fit.evidence) / self.scale / self.temperature
 
 
@@ -170,17 +172,17 @@ def rank(
         say("level and colour of the noise")
         first = rough[0][1]
         best = refitted(
-            bench, first.hypothesis, changes=_elements(first, bench), steps=effort.steps, gain=FINE
+            bench, first.hypothesis, changes=changes_of(first, bench), steps=effort.steps, gain=FINE
         )
         bench = weighed_anew(bench, best)
-        without = refitted(bench, base, changes=_elements(without, bench), states=without.fit.states)
+        without = refitted(bench, base, changes=changes_of(without, bench), states=without.fit.states)
         ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
     done: dict[int, Refit] = {}
 
     def thoroughly(i: int) -> None:
         c, r = rough[i]
         say(f"{c.kind} at {_label(c.place)}, thoroughly")
-        done[i] = refitted(bench, r.hypothesis, changes=_elements(r, bench), steps=effort.steps, gain=FINE)
+        done[i] = refitted(bench, r.hypothesis, changes=changes_of(r, bench), steps=effort.steps, gain=FINE)
 
     for i, (_, r) in enumerate(rough[: effort.refined]):
         if (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
@@ -199,6 +201,8 @@ def _values(
     rough: list[tuple[Candidate, Refit]], done: Mapping[int, Refit], bench: Bench, ratio: float
 ) -> list[float]:
     """Evidence of thorough fits; of the others what their rough ones lack to the best of those."""
+    if not rough:
+        return []
     own = {i: _value(r, bench) for i, r in done.items()}
     best = max(own, key=lambda i: own[i], default=0)
     top, level = _value(rough[best][1], bench), own.get(best, 0.0)
@@ -232,10 +236,6 @@ def _sensible(found: Refit, bench: Bench) -> bool:
     return True
 
 
-def _elements(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
-    return found.fit.theta[: len(bench.tolerance)]
-
-
 def _ranked(
     every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench, temperature: float
 ) -> Ranking:
@@ -266,7 +266,7 @@ def _changes(
     before: Refit | None, bench: Bench, wished: Float[np.ndarray, " e"] | None = None
 ) -> Float[np.ndarray, " e"] | None:
     if before is not None:
-        return before.fit.theta[: len(bench.tolerance)]
+        return changes_of(before, bench)
     return None if wished is None else np.asarray(wished)
 
 

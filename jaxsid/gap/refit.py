@@ -109,6 +109,16 @@ class Refit(NamedTuple):
     shot: Shot
 
 
+def changes_of(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
+    """Relative changes of the elements.
+
+    Args:
+        found: a fit.
+        bench: that it was fitted to.
+    """
+    return found.fit.theta[: len(bench.tolerance)]
+
+
 def bench_of(
     model: LumpedModel, records: Sequence[Record], noises: Sequence[Noise], refit: Recalibrated
 ) -> Bench:
