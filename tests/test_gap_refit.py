@@ -15,7 +15,7 @@ from jaxsid.gap.hypothesis import coordinates_of, parameter_rows
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of
 from jaxsid.gap.setting import slowest_rate
-from jaxsid.gap.shooting import parameters_of, products
+from jaxsid.gap.shooting import parameters_of, products_of
 from jaxsid.gap.windows import LEAD, LONGEST, SHORTEST, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS
 from jaxsid.mechanics.effects.prior import Amplitudes
@@ -260,7 +260,7 @@ def test_products_are_those_of_finite_differences(cubic):
     states = np.pad(0.01 * cubic.still * rng.standard_normal((len(block.y), 6)), ((0, 0), (0, 2)))
 
     def all_of(theta, states):
-        return products(shot, block, jnp.asarray(theta), jnp.asarray(states), jnp.asarray(2))
+        return products_of(shot, [block], theta, [states], 2)[0]
 
     slopes, p = [], len(theta)
     some = [

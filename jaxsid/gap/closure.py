@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import FIXED, Bench, Refit
-from jaxsid.gap.shooting import Prior, fitted, products
+from jaxsid.gap.shooting import Prior, fitted, products_of
 from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.records import Record
@@ -158,11 +157,8 @@ def _states(
 def _left(
     found: Refit, bench: Bench, blocks: Sequence[Block], states: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
-    return [
-        np.asarray(products(found.shot, b, theta, jnp.asarray(s), substeps).left)
-        for b, s in zip(blocks, states, strict=True)
-    ]
+    shot, theta = found.shot, found.fit.theta
+    return [np.asarray(x.left) for x in products_of(shot, blocks, theta, states, bench.substeps)]
 
 
 def closure_of(

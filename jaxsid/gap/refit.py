@@ -20,7 +20,7 @@ from jaxsid.gap.hypothesis import (
 from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
-from jaxsid.gap.shooting import GAIN, STEPS, Fit, Prior, Products, Shot, fitted, parameters_of, products
+from jaxsid.gap.shooting import GAIN, STEPS, Fit, Prior, Products, Shot, fitted, parameters_of, products_of
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
@@ -217,11 +217,7 @@ def in_windows(bench: Bench, found: Refit) -> list[Products]:
         bench: that it was fitted to.
         found: the fit.
     """
-    theta, substeps = jnp.asarray(found.fit.theta), jnp.asarray(bench.substeps)
-    return [
-        products(found.shot, block, theta, jnp.asarray(states), substeps)
-        for block, states in zip(bench.blocks, found.fit.states, strict=True)
-    ]
+    return products_of(found.shot, bench.blocks, found.fit.theta, found.fit.states, bench.substeps)
 
 
 def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ itself runs outside, so that few programs serve all candidates and records of an
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,8 +18,9 @@ from jaxtyping import Array, Float, Int
 from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
-from jaxsid.mechanics.augmented import augmented
-from jaxsid.mechanics.nonlinear import Response, forced, respond_to
+from jaxsid.mechanics.effects.catalogue import Sorted
+from jaxsid.mechanics.sensitivity import Laws, Windows, marched, prepared
+from jaxsid.mechanics.sensitivity import Prepared as LinearPart
 from jaxsid.mechanics.slots import Slots
 from jaxsid.physical.motion import counted
 from jaxsid.records import SecondOrderModel
@@ -106,35 +107,88 @@ class Prior(NamedTuple):
     states: Float[np.ndarray, " n"]
 
 
-@compiled_in_full
-def products(shot: Shot, block: Block, theta: Array, states: Array, substeps: Array) -> Products:
-    """What a step needs of a block.
+class Prepared(eqx.Module):
+    """A hypothesis with its unknowns, ready for windows: of the linear part and the parameters, values and slopes.
+
+    Attributes:
+        own, slopes: the linear part, from `sensitivity.prepared`, and by the unknowns, the last axis.
+        parameters: (records, slots, most).
+        parameter_slopes: (records, slots, most, p).
+        kinds: of the effects.
+        substeps: steps for each sampling interval.
+    """
+
+    own: LinearPart
+    slopes: LinearPart
+    parameters: Float[Array, "records slots most"]
+    parameter_slopes: Float[Array, "records slots most p"]
+    kinds: Sorted
+    substeps: Int[Array, ""]
+
+
+def ready(shot: Shot, theta: Array, dt: Array, records: int, substeps: Array) -> Prepared:
+    """A hypothesis with its unknowns.
 
     Args:
         shot: the hypothesis.
-        block: windows.
         theta: (p,) unknowns.
-        states: (windows, n) initial ones.
+        dt: sampling interval, s.
+        records: how many there are.
         substeps: steps for each sampling interval.
     """
-    p, n = len(theta), states.shape[1]
+    # the linear part is one program for kinds of all sorts
+    kinds = shot.slots.kinds
+    assert isinstance(kinds, Sorted)
+    plain = eqx.tree_at(lambda s: s.slots.kinds, shot, kinds.numbers)
+    own, slopes, *parameters = _linear_part(plain, theta, dt, records, substeps)
+    return Prepared(own, slopes, parameters[0], parameters[1], kinds, substeps)
 
-    def window(u: Array, y: Array, weight: Array, taps: Array, first: Array, record: Array, state: Array):
-        counts = counted(weight[None], taps)[0][block.lead :]
 
-        def residual(move: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-            of_record = parameters_of(shot, theta + move[:p], record)
-            found = _response(shot, theta + move[:p], of_record, state + move[p:], u, first, block, substeps)
-            left = found.outputs - y
-            r = (counts * _white(left, weight, taps)[block.lead :]).ravel()
-            return r, (r, left, found.forces)
+@compiled_in_full
+def _linear_part(shot: Shot, theta: Array, dt: Array, records: int, substeps: Array) -> tuple[Any, ...]:
+    def of(theta: Array) -> tuple[LinearPart, Array]:
+        # but for phases of periodic laws parameters are the same in all records
+        every = jnp.stack([parameters_of(shot, theta, i) for i in range(records)])
+        slots = eqx.tree_at(lambda s: s.parameters, shot.slots, every[0])
+        return prepared(matrices_of(shot, theta), slots, dt, substeps), every
 
-        slopes, (r, left, forces) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(p + n, theta.dtype))
-        rows = jnp.concatenate([slopes, r[:, None]], axis=1)
-        return Products(rows.T @ rows, (counts > 0).sum(), left, forces)
+    (own, every), (slopes, every_slopes) = of(theta), jax.jacfwd(of)(theta)
+    return own, slopes, every, every_slopes
 
-    parts = block.u, block.y, block.weight, block.taps, block.first, block.record, states
-    return jax.vmap(window)(*parts)
+
+@compiled_in_full
+def products(given: Prepared, block: Block, states: Array) -> Products:
+    """What a step needs of a block.
+
+    Args:
+        given: the hypothesis with its unknowns.
+        block: windows.
+        states: (windows, n) initial ones.
+    """
+    rows = lambda x: jnp.moveaxis(x[block.record], 0, -1)  # noqa: E731
+    laws = Laws(given.kinds, rows(given.parameters), rows(given.parameter_slopes))
+    windows = Windows(block.u, block.ramps, block.lead, block.dt, block.first, states)
+    found = marched(given.own, given.slopes, laws, windows, given.substeps)
+    turned = lambda x: jnp.moveaxis(x, -1, 0)  # noqa: E731
+    left = turned(found.outputs).at[:, :, :, 0].add(-block.y)
+    counts = jax.vmap(lambda weight, taps: counted(weight[None], taps)[0])(block.weight, block.taps)[
+        :, block.lead :
+    ]
+    white = _white(jnp.where(block.weight[..., None] > 0, left, 0.0), block.taps, block.lead)
+    rows = (white * counts[..., None]).reshape(len(left), -1, left.shape[-1])
+    # the residual comes last
+    rows = jnp.concatenate([rows[..., 1:], rows[..., :1]], axis=2)
+    gram = jnp.einsum("wrp,wrq->wpq", rows, rows)
+    return Products(gram, (counts > 0).sum(axis=(1, 2)), left[..., 0], turned(found.forces))
+
+
+def _white(left: Array, taps: Array, lead: int) -> Float[Array, "windows length outputs columns"]:
+    """Filtered, without the samples before a window, where the filter has settled."""
+    count = taps.shape[-1]
+    before = jnp.pad(left, ((0, 0), (max(count - 1 - lead, 0), 0), (0, 0), (0, 0)))
+    length, begin = left.shape[1] - lead, before.shape[1] - left.shape[1] + lead
+    parts = (taps[:, None, :, k, None] * before[:, begin - k : begin - k + length] for k in range(count))
+    return sum(parts, start=jnp.zeros(()))
 
 
 def parameters_of(shot: Shot, theta: Array, record: Array | int) -> Float[Array, "slots most"]:
@@ -167,30 +221,6 @@ def matrices_of(shot: Shot, theta: Array) -> SecondOrderModel:
         for x, d in zip((linear.mass, linear.damping, linear.stiffness), shot.directions, strict=True)
     ]
     return eqx.tree_at(lambda s: (s.mass, s.damping, s.stiffness), linear, tuple(moved))
-
-
-def _response(
-    shot: Shot,
-    theta: Array,
-    parameters: Array,
-    state: Array,
-    u: Array,
-    first: Array,
-    block: Block,
-    substeps: Array,
-) -> Response:
-    slots = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters)
-    # the linear part does not depend on phases: one for all records
-    common = eqx.tree_at(lambda s: s.parameters, shot.slots, parameters_of(shot, theta, 0))
-    system = augmented(matrices_of(shot, theta), common)
-    late = forced(system, common, u, block.ramps, block.dt)
-    late = eqx.tree_at(lambda x: x[:4], late, tuple(x[block.lead :] for x in late[:4]))
-    return respond_to(system, slots, late, block.dt, state, substeps, first)
-
-
-def _white(left: Array, weight: Array, taps: Array) -> Float[Array, "length outputs"]:
-    r = jnp.where(weight > 0, left, 0.0)
-    return jnp.stack([taps[:, k] * jnp.roll(r, k, axis=0) for k in range(taps.shape[1])]).sum(axis=0)
 
 
 def fitted(
@@ -240,6 +270,32 @@ def fitted(
     return _concluded(at, prior, done, settled)
 
 
+def products_of(
+    shot: Shot,
+    blocks: Sequence[Block],
+    theta: Float[np.ndarray, " p"],
+    states: Sequence[Float[np.ndarray, "windows n"]],
+    substeps: int,
+) -> list[Products]:
+    """What a step needs of all blocks.
+
+    Args:
+        shot: the hypothesis.
+        blocks: windows.
+        theta: (p,) unknowns.
+        states: of each block (windows, n), initial ones.
+        substeps: steps for each sampling interval.
+    """
+    records = 1 + (len(theta) - len(shot.directions[0]) - shot.coordinates.centre.size) // shot.slots.count
+    number, by_interval = jnp.asarray(substeps), {}
+    for block in blocks:
+        if (dt := float(block.dt)) not in by_interval:
+            by_interval[dt] = ready(shot, jnp.asarray(theta), block.dt, records, number)
+    return [
+        products(by_interval[float(b.dt)], b, jnp.asarray(s)) for b, s in zip(blocks, states, strict=True)
+    ]
+
+
 class _At(NamedTuple):
     """A point of the search: unknowns, states, cost, its squares, gram (windows, q, q) and equations of all windows."""
 
@@ -259,11 +315,7 @@ def _evaluated(
     states: list[np.ndarray],
     substeps: int,
 ) -> _At:
-    number = jnp.asarray(substeps)
-    parts = [
-        products(shot, b, jnp.asarray(theta), jnp.asarray(s), number)
-        for b, s in zip(blocks, states, strict=True)
-    ]
+    parts = products_of(shot, blocks, theta, states, substeps)
     gram = np.concatenate([np.asarray(x.gram) for x in parts])
     equations = sum(int(np.asarray(x.equations).sum()) for x in parts)
     squares = float(gram[:, -1, -1].sum())

@@ -36,7 +36,7 @@ class Path(NamedTuple):
     mean_force: Float[Array, "samples ports"]
 
 
-class _Step(eqx.Module):
+class Step(eqx.Module):
     """Matrices of one step; everything that the linear part does is in the first product.
 
     Attributes:
@@ -73,21 +73,35 @@ def phi_columns(A: Array, columns: Array, h: Array) -> tuple[Array, Array, Array
     return found[:n, :n], one, two, three
 
 
-def _step(system: Augmented, h: Array) -> _Step:
-    A, seen, ports, inputs = system.A, system.seen, system.G.shape[1], system.B.shape[1]
-    slots = ports // 2
+def moved_by(system: Augmented, times: Float[Array, " k"]) -> tuple[Array, Array, Array, Array]:
+    """`phi_columns` of all ports, then all inputs, for several times at once, which makes a short program.
+
+    Args:
+        system: from `augmented`.
+        times: s.
+    """
     columns = jnp.concatenate([system.G, system.B], axis=1)
-    # both at once, which makes half the program
-    both = jax.vmap(partial(phi_columns, A, columns))(jnp.stack([h, h / 2]))
-    whole, one, two, three = (x[0] for x in both)
-    half, one_half, two_half, _ = (x[1] for x in both)
+    return jax.vmap(partial(phi_columns, system.A, columns))(times)
+
+
+def step_of(system: Augmented, moved: tuple[Array, Array, Array, Array]) -> Step:
+    """Matrices of one step.
+
+    Args:
+        system: from `augmented`.
+        moved: from `moved_by`, the first two times a step and half of it.
+    """
+    seen, ports, inputs = system.seen, system.G.shape[1], system.B.shape[1]
+    slots = ports // 2
+    whole, one, two, three = (x[0] for x in moved)
+    half, one_half, two_half, _ = (x[1] for x in moved)
     end = jnp.concatenate([whole, one[:, ports:], two[:, ports:]], axis=1)
     # the change over the step acts by half over its first half
     middle = jnp.concatenate([half, one_half[:, ports:], two_half[:, ports:] / 2], axis=1)
-    start = jnp.concatenate([seen, jnp.zeros((3 * slots, 2 * inputs), A.dtype)], axis=1)
+    start = jnp.concatenate([seen, jnp.zeros((3 * slots, 2 * inputs), seen.dtype)], axis=1)
     G1, G2, G3 = (x[:, :ports] for x in (one, two, three))
     first_half = one_half[:, :ports]
-    return _Step(
+    return Step(
         linear=jnp.concatenate([end, start, seen @ middle, seen @ end]),
         middle=seen @ first_half,
         carried=seen @ half @ first_half,
@@ -131,7 +145,7 @@ def integrate(
         first: number of the first sample in the record.
     """
     h = dt / substeps
-    step = _step(system, h)
+    step = step_of(system, moved_by(system, jnp.stack([h, h / 2])))
     n, count = len(system.A), slots.count
     ports = 2 * count
     speeds = system.seen[count : 2 * count]
@@ -169,9 +183,9 @@ def integrate(
     def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
         x, sliding = carry
         of_sample = Late(*row[:-1].reshape(5, inputs))
-        step_of = partial(advance, of_sample=of_sample, number=row[-1])
+        one = partial(advance, of_sample=of_sample, number=row[-1])
         begin = (x, sliding, jnp.zeros(ports, x.dtype))
-        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: step_of(i, c), begin)
+        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: one(i, c), begin)
         return (x1, after), jnp.concatenate([x, sliding, mean])
 
     _, found = lax.scan(sample, (state, _sliding_at(speeds, state)), rows)

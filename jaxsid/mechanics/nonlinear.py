@@ -73,11 +73,42 @@ def forced(
         ramps: which are held to first order, the others to zero order.
         dt: sampling interval, s.
     """
+    return held(scaled_inputs(system, slots, dt), u, ramps)
+
+
+class Scaled(NamedTuple):
+    """What effects do to inputs: one over the limit, 0 where there is none; gain; delay in sampling intervals."""
+
+    inverse_limit: Float[Array, " inputs"]
+    gain: Float[Array, " inputs"]
+    delay: Float[Array, " inputs"]
+
+
+def scaled_inputs(system: Augmented, slots: Slots, dt: Array) -> Scaled:
+    """What effects do to inputs, their lag apart.
+
+    Args:
+        system: from `augmented`.
+        slots: the effects.
+        dt: sampling interval, s.
+    """
     change = system.changed
-    inverse = change.inverse_limit @ slots.inputs
+    return Scaled(
+        change.inverse_limit @ slots.inputs, 1 + change.gain @ slots.inputs, change.delay @ slots.inputs / dt
+    )
+
+
+def held(scaled: Scaled, u: Float[Array, "samples inputs"], ramps: Bool[Array, " inputs"]) -> Late:
+    """Inputs limited first, then scaled, then late.
+
+    Args:
+        scaled: what effects do to them.
+        u: samples.
+        ramps: which are held to first order, the others to zero order.
+    """
+    inverse = scaled.inverse_limit
     limit = jnp.where(inverse > 0, 1 / jnp.where(inverse > 0, inverse, 1.0), jnp.inf)
-    pushed = jnp.clip(u, -limit, limit) * (1 + change.gain @ slots.inputs)
-    return late_input(pushed, ramps, change.delay @ slots.inputs / dt)
+    return late_input(jnp.clip(u, -limit, limit) * scaled.gain, ramps, scaled.delay)
 
 
 def respond_to(
