@@ -362,19 +362,19 @@ def _slope_of(kind: Kind) -> Callable[..., tuple[Array, Array]]:
     def found(
         parameters: Array, d: Array, v: Array, z: Array, spring: Array, time: Array
     ) -> tuple[Array, Array]:
-        own = len(kind.parameters)
-
         def law(*x: Array) -> Array:
-            motion = Motion(*x[own : own + 3], time, x[own + 3])
-            values = (f(motion, *x[:own]) if f else jnp.zeros_like(d) for f in (kind.force, kind.rate))
+            *own, d, v, z, spring = x
+            motion = Motion(d, v, z, time, spring)
+            values = (f(motion, *own) if f else jnp.zeros_like(d) for f in (kind.force, kind.rate))
             return jnp.stack([jnp.broadcast_to(y, d.shape) for y in values])
 
-        value, back = jax.vjp(law, *parameters[:own], d, v, z, jnp.broadcast_to(spring, d.shape))
+        count = len(kind.parameters)
+        value, back = jax.vjp(law, *parameters[:count], d, v, z, jnp.broadcast_to(spring, d.shape))
         one, none = jnp.ones_like(d), jnp.zeros_like(d)
         by_both = zip(back(jnp.stack([one, none])), back(jnp.stack([none, one])), strict=True)
         along = [jnp.stack(x) for x in by_both]
-        padding = [jnp.zeros_like(value)] * (len(parameters) - own)
-        return value, jnp.stack([*along[:own], *padding, *along[own:]])
+        padding = [jnp.zeros_like(value)] * (len(parameters) - count)
+        return value, jnp.stack([*along[:count], *padding, *along[count:]])
 
     return found
 
