@@ -145,19 +145,26 @@ def diagnose(
     initial: Annotated[
         Initial, typer.Option(help="Initial state of each record; rest warns where it is not.")
     ] = Initial.estimate,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run for this folder that was cut off.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Where the model and the records part, which effect causes it, and how far the gap shrinks with that effect."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
+        from jaxsid.files.atomic import nearest_folder
         from jaxsid.files.model_toml import read_model
         from jaxsid.files.record_file import read_records
         from jaxsid.gap.diagnose import diagnose as run
+        from jaxsid.gap.resume import resumable
 
         nominal = read_model(model)
-        found = run(nominal, read_records(records, nominal), initial=initial.value, progress=say)
-        _write_diagnosis(found, out, say)
+        given = read_records(records, nominal)
+        with resumable(nearest_folder(out) / f".{out.name}.unfinished", resume=resume):
+            found = run(nominal, given, initial=initial.value, progress=say)
+            _write_diagnosis(found, out, say)
     if not quiet:
         _diagnosis_summary(found, out)
 

@@ -76,7 +76,7 @@ def keep_programs(folder: str | Path | None, *, hurry: bool = False) -> None:
     if folder is None:
         _kept = None
         return
-    _kept = _Folder(Path(folder) / "programs", _stamp(), HURRIED if hurry else {})
+    _kept = _Folder(Path(folder) / "programs", source_stamp(), HURRIED if hurry else {})
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update(LEAST_TIME, 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -183,7 +183,7 @@ class _Described:
 
 
 @functools.cache
-def _stamp() -> bytes:
+def source_stamp() -> bytes:
     """All that a program depends on besides the call."""
     digest = hashlib.sha256()
     for source in sorted(Path(__file__).parent.rglob("*.py")):

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import FIXED, Bench, Refit
+from jaxsid.gap.resume import step
 from jaxsid.gap.shooting import Prior, fitted, products_of
 from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -86,6 +87,7 @@ def seen_part(record: Record) -> Record:
     )
 
 
+@step
 def left_of(found: Refit, bench: Bench, records: Sequence[Record], *, windowed: bool) -> Left:
     """What a fitted model leaves of held-out samples, running on from the last state that was fitted before them.
 

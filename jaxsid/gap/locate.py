@@ -11,6 +11,7 @@ from jaxsid.gap.apart import COMPARED, expected_differences, same_force, sets_of
 from jaxsid.gap.force_map import ForceMap, force_map
 from jaxsid.gap.noise import Noise, deviations, noise_of
 from jaxsid.gap.places import Place, places_of
+from jaxsid.gap.resume import step
 from jaxsid.gap.scoring import Scores, scores
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import spectra_of
@@ -115,6 +116,7 @@ def locate(
     return located(scored(model, records, noises=noises, places=places))
 
 
+@step
 def scored(
     model: LumpedModel,
     records: Record | Sequence[Record],

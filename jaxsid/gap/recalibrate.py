@@ -13,6 +13,7 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.compilation import compiled
 from jaxsid.gap.evidence import factor_of, table
 from jaxsid.gap.noise import Noise, residual_noise
+from jaxsid.gap.resume import step
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import Motion, in_time, motion_under, parameter_columns, spectra_of
 from jaxsid.mechanics.lumped import LumpedModel
@@ -67,6 +68,7 @@ class Recalibrated(NamedTuple):
     equations: int
 
 
+@step
 def recalibrated(
     model: LumpedModel,
     records: Sequence[Record],

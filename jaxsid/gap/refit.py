@@ -19,6 +19,7 @@ from jaxsid.gap.hypothesis import (
 )
 from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
+from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
 from jaxsid.gap.shooting import GAIN, STEPS, Fit, Prior, Products, Shot, fitted, parameters_of, products_of
 from jaxsid.gap.spectra import in_time
@@ -225,6 +226,7 @@ def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:
     return np.where((at >= 0)[:, None], motion[np.clip(at, 0, len(motion) - 1)], 0.0)
 
 
+@step
 def refitted(
     bench: Bench,
     hypothesis: Hypothesis,

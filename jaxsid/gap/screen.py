@@ -22,6 +22,7 @@ from jaxsid.gap.evidence import Table, evidence
 from jaxsid.gap.grids import Grid, grid_of, parameters_of, plan_of
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import ports_of
+from jaxsid.gap.resume import step
 from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS
@@ -69,6 +70,7 @@ class _Rows(NamedTuple):
     slots: Slots
 
 
+@step
 def screen(
     model: LumpedModel,
     settings: Sequence[Setting],

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsid.mechanics.effects.kind import FORCE, Kind, Motion, Parameter
-from jaxsid.mechanics.effects.prior import PART, Scale
+from jaxsid.mechanics.effects.prior import Scale, slab
 
 
 def _force(at: Motion, force: Array) -> Array:
@@ -14,7 +14,8 @@ def _force(at: Motion, force: Array) -> Array:
 EFFECT = Kind(
     name="constant_load",
     where="body",
-    parameters=(Parameter("force", FORCE, Scale(force=1), PART),),
+    # unlike other forces it does not go by how the place moves
+    parameters=(Parameter("force", FORCE, Scale(force=1), slab(10.0)),),
     law="constant force on the body",
     about="Weight along a tilted axis, a preload, an offset of the drive's amplifier.",
     source="A. Janot, M. Gautier and M. Brunot, Data set and reference models of EMPS, 2019.",
