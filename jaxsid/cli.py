@@ -140,7 +140,8 @@ def diagnose(
     model: ModelFile,
     records: RecordFiles,
     out: Annotated[
-        Path, typer.Option(help="Folder for diagnosis.json, model.toml, forces.npz and report.html.")
+        Path,
+        typer.Option(help="Folder for diagnosis.json, model.toml, forces.npz, next_input.csv, report.html."),
     ],
     initial: Annotated[
         Initial, typer.Option(help="Initial state of each record; rest warns where it is not.")
@@ -406,6 +407,7 @@ def _write(found, out: Path, say, later: str | None = None) -> None:
 def _write_diagnosis(found, out: Path, say) -> None:
     """All files, or none."""
     from jaxsid.files.atomic import atomic_directory
+    from jaxsid.files.csv_out import write_record
     from jaxsid.files.model_toml import write_model
     from jaxsid.files.results_json import write_json
     from jaxsid.report.force_file import write_forces
@@ -420,6 +422,8 @@ def _write_diagnosis(found, out: Path, say) -> None:
             header="Numbers refitted and effects found by jaxsid in measured records.",
         )
         write_forces(found, draft / "forces.npz")
+        if found.experiment is not None:
+            write_record(found.experiment.record, draft / "next_input.csv")
         write_diagnosis_report(found, draft / "report.html")
 
 

@@ -1,5 +1,6 @@
 """Why a model and records part: effects found one after another, how far the gap shrinks, and what is left."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -40,6 +41,7 @@ SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 3.0  # tempered gain of evidence from which on a further effect is taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
+PLACES = 2  # of one kind that are tried before other kinds, where something was found already
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.02  # and of all that is left
 
@@ -189,8 +191,20 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         before = len(at.selected)
         at = _further(at, candidates, FURTHER if before > begun else FIRST, model, seen, say)
         # what came next to the first effect, in turn with what now comes first
-        candidates = tuple(c for pair in zip(_candidates(at.look), first[1:], strict=False) for c in pair)
+        now = _varied(_candidates(at.look))
+        candidates = tuple(c for pair in zip(now, _varied(first[1:]), strict=False) for c in pair)
     return _needed(at, model, seen, say)
+
+
+def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The same, but those of a kind that has had its turn at several places come after all others."""
+    had: Counter[str] = Counter()
+    turns = []
+    for c in candidates:
+        had[c.kind] += 1
+        turns.append(had[c.kind] > PLACES)
+    order = sorted(range(len(candidates)), key=lambda i: turns[i])
+    return tuple(candidates[i] for i in order)
 
 
 def _further(

@@ -9,6 +9,7 @@ from jaxsid.checks import require
 from jaxsid.gap.causes import Causes, causes_of
 from jaxsid.gap.closure import Closure, seen_part
 from jaxsid.gap.examine import Examination, examine
+from jaxsid.gap.experiment import Experiment, experiment_between
 from jaxsid.gap.explain import (
     ERRORS,
     Explanation,
@@ -19,6 +20,7 @@ from jaxsid.gap.explain import (
     elements_by_key,
     key_of,
 )
+from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, plain_place, verdict_of
@@ -47,6 +49,8 @@ class Diagnosis(NamedTuple):
         verdict: "none", where the records agree with the model within noise and its tolerance; "effect", where the
             selected effects explain them; "ambiguous", where others do as well; "unknown", where none does.
         judgement: the verdict with its probability and what is not told apart.
+        experiment: that would tell the two most probable explanations apart; None where there is but one, or where a
+            model that drifts away predicts nothing.
         warnings: what is to be known before these numbers are used.
     """
 
@@ -55,6 +59,7 @@ class Diagnosis(NamedTuple):
     examination: Examination
     causes: Causes | None
     judgement: Verdict
+    experiment: Experiment | None
     warnings: tuple[str, ...]
 
     @property
@@ -254,8 +259,28 @@ def diagnose(
     causes = (
         causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
     )
+    verdict = verdict_of(found, causes)
     said = _warnings(model, seen, found, initial == "rest")
-    return Diagnosis(model, records, found, causes, verdict_of(found, causes), said)
+    return Diagnosis(
+        model, records, found, causes, verdict, _experiment(model, seen, causes, verdict, progress), said
+    )
+
+
+def _experiment(
+    model: LumpedModel,
+    records: tuple[Record, ...],
+    causes: Causes | None,
+    verdict: Verdict,
+    progress: Callable[[str], None] | None,
+) -> Experiment | None:
+    if causes is None or verdict.name != "ambiguous" or is_free_or_unstable(model):
+        return None
+    for ranking, likely in zip(causes.rounds, verdict.likely, strict=False):
+        if len(likely) > 1:
+            if progress is not None:
+                progress("what to measure next")
+            return experiment_between(likely[0], likely[1], ranking.bench, records)
+    return None
 
 
 def _warnings(

@@ -39,7 +39,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(8, 2, 12, TEMPERATURE)
+FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(10, 2, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 

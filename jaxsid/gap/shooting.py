@@ -30,6 +30,7 @@ GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
+SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 RIDGE = 1e-13  # of a matrix with ones on its diagonal: less than its rounding matters
 
@@ -248,7 +249,7 @@ def fitted(
         gain: of the cost, in mean squares of what is left, below which a helpful step is the last.
     """
     at = _evaluated(shot, blocks, prior, theta, list(states), substeps)
-    damping, growth, settled, done = DAMPING, 2.0, False, 1
+    damping, growth, settled, done = DAMPING, SLOWER, False, 1
     while done < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, damping)
         new = np.maximum(at.theta + move, prior.least)
@@ -258,12 +259,14 @@ def fitted(
         done += 1
         less = at.cost - found.cost
         if less > 0:
-            at, damping, growth = found, max(damping / 5, 1e-9), 2.0
+            # what has just failed with less damping would fail again
+            at, damping = found, damping if growth > SLOWER else max(damping / 5, 1e-9)
+            growth = SLOWER
             if less < gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost):
                 settled = True
                 break
         else:
-            damping, growth = damping * growth, 2 * growth
+            damping, growth = damping * growth, SLOWER * growth
             if damping > MOST_DAMPING:
                 settled = True
                 break

@@ -4,12 +4,15 @@ from typing import Any, Protocol, runtime_checkable
 
 from jaxsid.gap.causes import Causes
 from jaxsid.gap.examine import Examination
+from jaxsid.gap.experiment import Experiment
 from jaxsid.gap.explain import Explanation
 from jaxsid.gap.measure import Gap
 from jaxsid.gap.places import Place
 from jaxsid.gap.verdict import Verdict
 from jaxsid.mechanics.lumped import LumpedModel
 
+TELLS = 10.0  # log evidence below which an experiment is of no use
+PARTS = 0.01  # of a body's motion that a sensor is worth asking for
 APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 
 
@@ -25,6 +28,8 @@ class Found(Protocol):
     def causes(self) -> Causes | None: ...
     @property
     def judgement(self) -> Verdict: ...
+    @property
+    def experiment(self) -> Experiment | None: ...
     @property
     def verdict(self) -> str: ...
     def selected(self) -> list[dict[str, Any]]: ...
@@ -155,6 +160,8 @@ def next_experiment(found: Found) -> str:
     if causes is None or found.verdict == "none":
         told = all(n.degrees > 0 for n in found.examination.noises)
         return "" if told else "A record with repeated periods, or a quiet start, would tell the noise apart."
+    if found.experiment is not None:
+        return _experiment(found.experiment, next(x for x in found.judgement.likely if len(x) > 1))
     open_ones = [likely for likely in found.judgement.likely if len(likely) > 1]
     if open_ones:
         kinds = {x.kind for x in open_ones[0]}
@@ -173,3 +180,17 @@ def next_experiment(found: Found) -> str:
     return (
         "The same input at a third and at three times its level: how the force grows with it tells the law."
     )
+
+
+def _experiment(x: Experiment, likely: tuple[Explanation, ...]) -> str:
+    one, other = (named(y) for y in likely[:2])
+    if x.told < TELLS:
+        told = f"None of the inputs that were tried tells {one} from {other}."
+    else:
+        told = (
+            f"{x.name[0].upper()}{x.name[1:]} (next_input.csv): it tells {one} from {other} by an expected difference "
+            f"in log evidence of {x.told:.3g}."
+        )
+    if x.sensor is None or x.sensor[1] < PARTS:
+        return told
+    return f"{told} A displacement sensor on {x.sensor[0]} would show them {percent(x.sensor[1])} of its motion apart."
