@@ -21,7 +21,8 @@ from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 10.0  # of effects: what no law has decides more than noise
 MILD = 4.0  # of the model's numbers, whose equations are known
-ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 4, 1  # laws of many numbers take longer to be found
+ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 3, 1  # laws of many numbers take longer to be found
+LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 CLOSE = 20.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
@@ -164,6 +165,12 @@ def rank(
         start = _changes(before, bench, c.changes)
         steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
         rough.append((c, refitted(part, hypothesis, changes=start, steps=steps, gain=FINE)))
+    for few, more in LONGER:
+        rough.sort(key=lambda x: -_value(x[1], bench))
+        for i, (c, r) in enumerate(rough[:few]):
+            if not r.fit.settled:
+                begin = {"changes": changes_of(r, bench), "states": r.fit.states}
+                rough[i] = c, refitted(part, r.hypothesis, **begin, steps=more, gain=FINE)
     rough.sort(key=lambda x: -_value(x[1], bench))
     ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
