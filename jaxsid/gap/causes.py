@@ -30,7 +30,17 @@ from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
-from jaxsid.gap.refit import FIXED, Bench, Hypothesis, Refit, bench_of, changes_of, refitted, weighed_anew
+from jaxsid.gap.refit import (
+    FIXED,
+    Bench,
+    Hypothesis,
+    Refit,
+    bench_of,
+    changes_of,
+    refitted,
+    tied,
+    weighed_anew,
+)
 from jaxsid.gap.screen import Candidate, screen, unseen
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
@@ -43,7 +53,7 @@ POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 PLACES = 2  # of one kind that are tried before other kinds, where something was found already
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
-LEAST = 0.02  # and of all that is left
+LEAST = 0.01  # and of all that is left
 
 
 class Causes(NamedTuple):
@@ -169,6 +179,7 @@ class _Found(NamedTuple):
             bench = weighed_anew(bench, last) if again else bench
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
+            bench, last = tied(bench, last, steps=POLISHED)
         rounds = (*self.rounds[: len(self.selected)], ranking)
         return _Found(bench, self.look, rounds, (*self.selected, best._replace(refit=last)), last)
 

@@ -148,9 +148,9 @@ def _states(
     size = len(bench.still) // 2
     hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], found.shot.slots.count)
     same = np.full(len(theta), FIXED)
-    prior = Prior(
-        same, theta, np.full(len(theta), -np.inf), np.ones(len(theta)), np.concatenate([bench.still, hidden])
-    )
+    states = np.concatenate([bench.still, hidden])
+    least, most = np.full(len(theta), -np.inf), np.ones(len(theta))
+    prior = Prior(same, theta, least, most, states, np.full(len(states), np.inf))
     begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]
     fit = fitted(found.shot, blocks, prior, theta, begin, substeps=bench.substeps, steps=ROUNDS)
     return fit.states

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted, weighed_anew
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted, tied, weighed_anew
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
@@ -169,22 +169,17 @@ def rank(
         rough.sort(key=lambda x: -_value(x[1], bench))
         for i, (c, r) in enumerate(rough[:few]):
             if not r.fit.settled:
-                begin = {"changes": changes_of(r, bench), "states": r.fit.states}
-                rough[i] = c, refitted(part, r.hypothesis, **begin, steps=more, gain=FINE)
+                rough[i] = c, refitted(part, r.hypothesis, **_from(r, bench), steps=more, gain=FINE)
     rough.sort(key=lambda x: -_value(x[1], bench))
     ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
     top = _value(rough[0][1], bench) if rough else 0.0
-    if rough and any(n.degrees <= 0 for n in bench.noises):
-        say("level and colour of the noise")
-        first = rough[0][1]
-        best = refitted(
-            bench, first.hypothesis, changes=changes_of(first, bench), steps=effort.steps, gain=FINE
-        )
-        bench = weighed_anew(bench, best)
-        without = refitted(bench, base, changes=changes_of(without, bench), states=without.fit.states)
-        ratio = ratio * best.fit.equations / max(best.fit.squares, np.finfo(float).tiny)
     done: dict[int, Refit] = {}
+    if rough:
+        say("level and colour of the noise")
+        bench, done[0], more = _weighed(bench, rough[0][1], effort)
+        ratio = ratio * more
+        without = refitted(bench, base, **_from(without, bench))
 
     def thoroughly(i: int) -> None:
         c, r = rough[i]
@@ -192,7 +187,7 @@ def rank(
         done[i] = refitted(bench, r.hypothesis, changes=changes_of(r, bench), steps=effort.steps, gain=FINE)
 
     for i, (_, r) in enumerate(rough[: effort.refined]):
-        if (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
+        if i not in done and (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
             thoroughly(i)
     # what was fitted roughly is not to come first
     while (values := _values(rough, done, bench, ratio)) and (i := int(np.argmax(values))) not in done:
@@ -202,6 +197,27 @@ def rank(
     last = dict(enumerate(r for _, r in rough)) | done
     every = [(c, last[i], values[i]) for i, (c, _) in enumerate(rough)]
     return _ranked(every, without, bench, effort.temperature)
+
+
+def _weighed(bench: Bench, found: Refit, effort: Effort) -> tuple[Bench, Refit, float]:
+    """The bench as a rough fit suggests: its noise, where nothing else tells of it, and whether windows are tied.
+
+    Also that fit done thoroughly, and by what factor squares in noise have changed.
+    """
+    best = refitted(bench, found.hypothesis, changes=changes_of(found, bench), steps=effort.steps, gain=FINE)
+    ratio = 1.0
+    if any(n.degrees <= 0 for n in bench.noises):
+        bench, ratio = (
+            weighed_anew(bench, best),
+            best.fit.equations / max(best.fit.squares, np.finfo(float).tiny),
+        )
+        best = refitted(bench, best.hypothesis, **_from(best, bench), steps=effort.steps, gain=FINE)
+    return *tied(bench, best, steps=effort.steps, gain=FINE), ratio
+
+
+def _from(found: Refit, bench: Bench) -> dict[str, Any]:
+    """Where a further fit begins."""
+    return {"changes": changes_of(found, bench), "states": found.fit.states}
 
 
 def _values(

@@ -35,6 +35,7 @@ FIXED = 1e-9  # deviation of what does not vary
 MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
 LEAST_ELEMENT = -0.95
+JUMP = 0.02  # of the noise next to the signal: far less than a window tells of its states
 STEPS_A_PERIOD = 20.0  # of the quickest vibration
 MOST_SUBSTEPS = 8
 
@@ -53,6 +54,8 @@ class Bench(NamedTuple):
         records: how many there are.
         substeps: steps for each sampling interval.
         noises: of each record, that the blocks are weighed by.
+        jump: of a state from where a window ends to where the next begins, next to how large states are; infinite where
+            each stands alone.
     """
 
     model: LumpedModel
@@ -65,6 +68,7 @@ class Bench(NamedTuple):
     records: int
     substeps: int
     noises: tuple[Noise, ...]
+    jump: float = np.inf
 
     def part(self, blocks: int) -> "Bench":
         """The same with some blocks only, from all along the records.
@@ -211,6 +215,31 @@ def weighed_anew(bench: Bench, found: Refit) -> Bench:
     return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
 
 
+def tied(bench: Bench, found: Refit, *, steps: int, gain: float = GAIN) -> tuple[Bench, Refit]:
+    """Each window leading to the next, if the evidence of a fit is the larger for it; else both as they are.
+
+    Windows that stand alone forgive what a model gets wrong slowly, near a resonance above all. Where the model drifts
+    away from records, on a free axis or with an effect still to be found, they are all that can be compared.
+
+    Args:
+        bench: records.
+        found: a fit to all of it.
+        steps: most evaluations.
+        gain: of the search, below which it has come to an end.
+    """
+    if np.isfinite(bench.jump):
+        return bench, found
+    shown = np.concatenate(
+        [(np.asarray(b.y) * np.asarray(b.weight)).reshape(-1, b.y.shape[2]) for b in bench.blocks]
+    )
+    shown = np.where(shown != 0, shown, np.nan)
+    level = 1 / np.exp(np.log(np.nanstd(shown, axis=0)).mean())
+    chained = bench._replace(jump=JUMP * level)
+    begin = {"changes": changes_of(found, bench), "states": found.fit.states}
+    new = refitted(chained, found.hypothesis, **begin, steps=steps, gain=gain)
+    return (chained, new) if new.fit.evidence > found.fit.evidence else (bench, found)
+
+
 def in_windows(bench: Bench, found: Refit) -> list[Products]:
     """What a fit leaves of every block, and the forces there.
 
@@ -292,7 +321,8 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     size = len(bench.still) // 2
     # an effect's own state is about as large as what moves there
     hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], shot.slots.count)
-    return Prior(deviation, np.zeros(len(deviation)), least, most, np.concatenate([bench.still, hidden]))
+    states = np.concatenate([bench.still, hidden])
+    return Prior(deviation, np.zeros(len(deviation)), least, most, states, bench.jump * states / LARGE)
 
 
 def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Refit:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsid.compilation import compiled_in_full
+from jaxsid.gap.chain import RIDGE, Chain, Links
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
 from jaxsid.mechanics.effects.catalogue import Sorted
@@ -32,7 +33,6 @@ DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
-RIDGE = 1e-13  # of a matrix with ones on its diagonal: less than its rounding matters
 
 
 class Shot(eqx.Module):
@@ -59,12 +59,14 @@ class Products(NamedTuple):
         equations: (windows,) entries of the residual that count.
         left: (windows, lead + length, outputs) simulated less measured.
         forces: (windows, lead + length, slots) of each effect.
+        ends: (windows, n, 1 + p + n) states where the next window begins, then their slopes.
     """
 
     gram: Float[Array, "windows q q"]
     equations: Int[Array, " windows"]
     left: Float[Array, "windows length outputs"]
     forces: Float[Array, "windows length slots"]
+    ends: Float[Array, "windows n columns"]
 
 
 class Fit(NamedTuple):
@@ -99,6 +101,7 @@ class Prior(NamedTuple):
         least: (p,) smallest values that make sense.
         most: (p,) largest change in a step.
         states: (n,) standard deviations of initial states.
+        jump: (n,) from where a window ends to where the next begins; infinite where each stands alone.
     """
 
     deviation: Float[np.ndarray, " p"]
@@ -106,6 +109,7 @@ class Prior(NamedTuple):
     least: Float[np.ndarray, " p"]
     most: Float[np.ndarray, " p"]
     states: Float[np.ndarray, " n"]
+    jump: Float[np.ndarray, " n"]
 
 
 class Prepared(eqx.Module):
@@ -168,7 +172,9 @@ def products(given: Prepared, block: Block, states: Array) -> Products:
     """
     rows = lambda x: jnp.moveaxis(x[block.record], 0, -1)  # noqa: E731
     laws = Laws(given.kinds, rows(given.parameters), rows(given.parameter_slopes))
-    windows = Windows(block.u, block.ramps, block.lead, block.dt, block.first, states)
+    windows = Windows(
+        block.u, block.ramps, block.lead, block.dt, block.first, states, block.y.shape[1] - block.lead
+    )
     found = marched(given.own, given.slopes, laws, windows, given.substeps)
     turned = lambda x: jnp.moveaxis(x, -1, 0)  # noqa: E731
     left = turned(found.outputs).at[:, :, :, 0].add(-block.y)
@@ -180,7 +186,9 @@ def products(given: Prepared, block: Block, states: Array) -> Products:
     # the residual comes last
     rows = jnp.concatenate([rows[..., 1:], rows[..., :1]], axis=2)
     gram = jnp.einsum("wrp,wrq->wpq", rows, rows)
-    return Products(gram, (counts > 0).sum(axis=(1, 2)), left[..., 0], turned(found.forces))
+    return Products(
+        gram, (counts > 0).sum(axis=(1, 2)), left[..., 0], turned(found.forces), turned(found.ends)
+    )
 
 
 def _white(left: Array, taps: Array, lead: int) -> Float[Array, "windows length outputs columns"]:
@@ -248,13 +256,14 @@ def fitted(
         steps: most evaluations.
         gain: of the cost, in mean squares of what is left, below which a helpful step is the last.
     """
-    at = _evaluated(shot, blocks, prior, theta, list(states), substeps)
+    links = links_of(blocks if np.isfinite(prior.jump).all() else ())
+    at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
     damping, growth, settled, done = DAMPING, SLOWER, False, 1
     while done < steps and np.isfinite(at.cost):
-        move, moves = _step(at, prior, damping)
+        move, moves = _step(at, prior, links, damping)
         new = np.maximum(at.theta + move, prior.least)
         found = _evaluated(
-            shot, blocks, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
+            shot, blocks, links, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
         )
         done += 1
         less = at.cost - found.cost
@@ -270,7 +279,7 @@ def fitted(
             if damping > MOST_DAMPING:
                 settled = True
                 break
-    return _concluded(at, prior, done, settled)
+    return _concluded(at, prior, links, done, settled)
 
 
 def products_of(
@@ -300,7 +309,17 @@ def products_of(
 
 
 class _At(NamedTuple):
-    """A point of the search: unknowns, states, cost, its squares, gram (windows, q, q) and equations of all windows."""
+    """A point of the search.
+
+    Attributes:
+        theta: unknowns.
+        states: of every block.
+        cost: half the sum of all squares, those of the priors too.
+        squares: of the residual.
+        gram: (windows, q, q) of all windows.
+        equations: how many entries of the residual count.
+        ends: (windows, n, 1 + p + n) states where the next window begins, and their slopes.
+    """
 
     theta: np.ndarray
     states: list[np.ndarray]
@@ -308,106 +327,176 @@ class _At(NamedTuple):
     squares: float
     gram: np.ndarray
     equations: int
+    ends: np.ndarray
+
+
+class _Normal(NamedTuple):
+    """Derivatives of the cost.
+
+    Attributes:
+        own: (p, p) second ones by the unknowns.
+        slope: (p,) first ones.
+        mixed: (windows, n, p) second ones by states and unknowns.
+        slopes: (windows, n) first ones by states.
+        chain: second ones by states.
+    """
+
+    own: np.ndarray
+    slope: np.ndarray
+    mixed: np.ndarray
+    slopes: np.ndarray
+    chain: Chain
+
+    def reduced(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Second and first derivatives by the unknowns where states follow, (p, p + 1); how states do so, (windows, n,
+        p + 1); the logarithm of the states' determinant."""
+        back, determinant = self.chain.solved(np.concatenate([self.mixed, self.slopes[:, :, None]], axis=2))
+        whole = np.concatenate([self.own, self.slope[:, None]], axis=1)
+        return whole - np.einsum("wnp,wnq->pq", self.mixed, back), back, determinant
+
+
+def links_of(blocks: Sequence[Block]) -> Links:
+    """Windows that lead to the next one of the same record, numbered through all blocks.
+
+    Args:
+        blocks: windows.
+    """
+    if not blocks:
+        return Links(np.zeros(0, int), np.zeros(0, int))
+    length = blocks[0].y.shape[1] - blocks[0].lead
+    record, first = (np.concatenate([np.asarray(getattr(b, n)) for b in blocks]) for n in ("record", "first"))
+    judged = np.concatenate([(np.asarray(b.weight)[:, b.lead :] > 0).any(axis=(1, 2)) for b in blocks])
+    at = {(r, f): i for i, (r, f) in enumerate(zip(record.tolist(), first.tolist(), strict=True))}
+    pairs = [
+        (i, at[r, f + length])
+        for (r, f), i in at.items()
+        if (r, f + length) in at and judged[i] and judged[at[r, f + length]]
+    ]
+    before, after = np.array(pairs, int).reshape(-1, 2).T
+    return Links(before, after)
 
 
 def _evaluated(
     shot: Shot,
     blocks: Sequence[Block],
+    links: Links,
     prior: Prior,
     theta: np.ndarray,
     states: list[np.ndarray],
     substeps: int,
 ) -> _At:
     parts = products_of(shot, blocks, theta, states, substeps)
-    gram = np.concatenate([np.asarray(x.gram) for x in parts])
+    gram, ends = (np.concatenate([np.asarray(getattr(x, n)) for x in parts]) for n in ("gram", "ends"))
     equations = sum(int(np.asarray(x.equations).sum()) for x in parts)
     squares = float(gram[:, -1, -1].sum())
-    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (
-        (np.concatenate(states) / prior.states) ** 2
-    ).sum()
+    at = _At(theta, states, np.inf, squares, gram, equations, ends)
+    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (_stray(at, prior, links) ** 2).sum()
+    own += (_jumps(at, prior, links) ** 2).sum()
     cost = 0.5 * (squares + float(own))
-    fine = np.isfinite(gram).all() and np.isfinite(cost)
-    return _At(theta, states, cost if fine else np.inf, squares, gram, equations)
+    return at._replace(cost=cost) if np.isfinite(gram).all() and np.isfinite(cost) else at
 
 
-def _normal(at: _At, prior: Prior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Second derivatives of the cost: of unknowns (p, p), mixed (windows, n, p), of states (windows, n, n)."""
+def _stray(at: _At, prior: Prior, links: Links) -> np.ndarray:
+    """(windows, n) initial states in deviations, 0 of those that another window leads to."""
+    found = np.concatenate(at.states) / prior.states
+    found[links.after] = 0.0
+    return found
+
+
+def _jumps(at: _At, prior: Prior, links: Links) -> np.ndarray:
+    """(links, n) from where windows end to where the next begin, in deviations."""
+    return (np.concatenate(at.states)[links.after] - at.ends[links.before, :, 0]) / prior.jump
+
+
+def _normal(at: _At, prior: Prior, links: Links) -> _Normal:
     p = len(at.theta)
     own = at.gram[:, :p, :p].sum(axis=0) + np.diag(prior.deviation**-2)
-    inner = at.gram[:, p:-1, p:-1] + np.diag(prior.states**-2)
-    return own, at.gram[:, p:-1, :p], inner
-
-
-def _step(at: _At, prior: Prior, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Changes of unknowns and of the states of every block."""
-    p = len(at.theta)
-    own, mixed, inner = _normal(at, prior)
-    own = own + damping * np.diag(np.diag(own))
-    inner = inner + damping * inner * np.eye(inner.shape[1])
     slope = at.gram[:, :p, -1].sum(axis=0) + (at.theta - prior.mean) / prior.deviation**2
-    slopes = at.gram[:, p:-1, -1] + np.concatenate(at.states) / prior.states**2
-    solved = _solved(inner, np.concatenate([mixed, slopes[:, :, None]], axis=2))
-    back, ahead = solved[:, :, :p], solved[:, :, p]
-    reduced = own - np.einsum("wnp,wnq->pq", mixed, back)
-    move = -_solved(reduced, (slope - np.einsum("wnp,wn->p", mixed, ahead))[:, None])[:, 0]
+    mixed, inner = at.gram[:, p:-1, :p].copy(), at.gram[:, p:-1, p:-1].copy()
+    free = np.ones(len(inner))
+    free[links.after] = 0.0
+    inner += free[:, None, None] * np.diag(prior.states**-2)
+    slopes = at.gram[:, p:-1, -1] + _stray(at, prior, links) / prior.states
+    # a jump in deviations, and its slopes by the unknowns and by the state before
+    jumps = _jumps(at, prior, links)
+    by_unknowns = -at.ends[links.before, :, 1 : 1 + p] / prior.jump[:, None]
+    by_state = -at.ends[links.before, :, 1 + p :] / prior.jump[:, None]
+    inverse = np.diag(1 / prior.jump)
+    own = own + np.einsum("lnp,lnq->pq", by_unknowns, by_unknowns)
+    slope = slope + np.einsum("lnp,ln->p", by_unknowns, jumps)
+    mixed[links.before] += by_state.mT @ by_unknowns
+    mixed[links.after] += inverse @ by_unknowns
+    inner[links.before] += by_state.mT @ by_state
+    inner[links.after] += inverse @ inverse
+    slopes[links.before] += np.einsum("lnm,ln->lm", by_state, jumps)
+    slopes[links.after] += jumps / prior.jump
+    return _Normal(own, slope, mixed, slopes, Chain(inner, by_state.mT @ inverse, links))
+
+
+def _step(at: _At, prior: Prior, links: Links, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Changes of unknowns and of the states of every block."""
+    p, normal = len(at.theta), _normal(at, prior, links)
+    inner = normal.chain.inner
+    normal = normal._replace(
+        own=normal.own + damping * np.diag(np.diag(normal.own)),
+        chain=normal.chain._replace(inner=inner + damping * inner * np.eye(inner.shape[1])),
+    )
+    reduced, back, _ = normal.reduced()
+    move = -_solved(reduced[:, :p], reduced[:, p:])[:, 0]
     move = move / max(1.0, np.abs(move / prior.most).max())
-    moves = -ahead - np.einsum("wnp,p->wn", back, move)
+    moves = -back[:, :, p] - np.einsum("wnp,p->wn", back[:, :, :p], move)
     return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
 
 
-def _solved(
-    matrix: Float[np.ndarray, "*w n n"], right: Float[np.ndarray, "*w n k"]
-) -> Float[np.ndarray, "*w n k"]:
-    """Of positive matrices whose rows differ by orders of magnitude."""
+def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Of a positive matrix whose rows differ by orders of magnitude."""
     scale, scaled = _unit(matrix)
-    whole = scaled + RIDGE * np.eye(scaled.shape[-1])
-    return np.linalg.solve(whole, right / scale[..., :, None]) / scale[..., :, None]
+    whole = scaled + RIDGE * np.eye(len(scaled))
+    return np.linalg.solve(whole, right / scale[:, None]) / scale[:, None]
 
 
 def _unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
-    return scale, matrix / scale[..., :, None] / scale[..., None, :]
+    scale = np.sqrt(np.diag(matrix))
+    return scale, matrix / scale[:, None] / scale
 
 
-def _log_determinant(matrix: np.ndarray) -> np.ndarray:
-    scale, scaled = _unit(matrix)
-    return np.asarray(2 * np.log(scale).sum(axis=-1) + np.linalg.slogdet(scaled)[1])
-
-
-def _covariance(
-    at: _At, prior: Prior, reduced: np.ndarray, mixed: np.ndarray, inner: np.ndarray
-) -> Float[np.ndarray, "p p"]:
+def _covariance(at: _At, normal: _Normal, reduced: np.ndarray, back: np.ndarray) -> Float[np.ndarray, "p p"]:
     """The inverse of the cost's second derivatives, its deviations no less than those that windows tell.
 
     Source: H. White, Econometrica 50 (1982).
     """
     p = len(reduced)
     found = _solved(reduced, np.eye(p))
-    if at.squares < MORE * max(at.equations, 1) or len(inner) < 2:
+    if at.squares < MORE * max(at.equations, 1) or len(back) < 2:
         return found
-    slopes = at.gram[:, p:-1, -1] + np.concatenate(at.states) / prior.states**2
-    each = at.gram[:, :p, -1] - np.einsum("wnp,wn->wp", mixed, _solved(inner, slopes[:, :, None])[:, :, 0])
+    # windows that lead to one another share what is left of either
+    each = at.gram[:, :p, -1] - np.einsum("wnp,wn->wp", back[:, :, :p], at.gram[:, p:-1, -1])
     moves = (each - each.mean(axis=0)) @ found
     told = (moves**2).sum(axis=0) * len(moves) / (len(moves) - 1)
     larger = np.sqrt(np.maximum(told / np.maximum(np.diag(found), np.finfo(float).tiny), 1.0))
     return found * larger * larger[:, None]
 
 
-def _concluded(at: _At, prior: Prior, steps: int, settled: bool) -> Fit:
-    own, mixed, inner = _normal(at, prior)
+def _concluded(at: _At, prior: Prior, links: Links, steps: int, settled: bool) -> Fit:
+    p = len(at.theta)
     if not np.isfinite(at.cost):
-        nothing = np.full((len(own), len(own)), np.nan)
+        nothing = np.full((p, p), np.nan)
         return Fit(at.theta, tuple(at.states), np.inf, 1, nothing, -np.inf, steps, False)
-    reduced = own - np.einsum("wnp,wnq->pq", mixed, _solved(inner, mixed))
-    determinant = float(_log_determinant(reduced) + _log_determinant(inner).sum())
-    determinant += 2 * float(np.log(prior.deviation).sum() + len(inner) * np.log(prior.states).sum())
+    normal = _normal(at, prior, links)
+    reduced, back, determinant = normal.reduced()
+    scale, scaled = _unit(reduced[:, :p])
+    determinant += 2 * float(np.log(scale).sum()) + float(np.linalg.slogdet(scaled)[1])
+    free = len(back) - len(links.after)
+    determinant += 2 * float(np.log(prior.deviation).sum() + free * np.log(prior.states).sum())
+    if len(links.after):
+        determinant += 2 * float(len(links.after) * np.log(prior.jump).sum())
     evidence = -at.cost - 0.5 * determinant
     return Fit(
         theta=at.theta,
         states=tuple(at.states),
         squares=at.squares,
         equations=at.equations,
-        covariance=_covariance(at, prior, reduced, mixed, inner),
+        covariance=_covariance(at, normal, reduced[:, :p], back),
         evidence=evidence if np.isfinite(evidence) else -np.inf,
         steps=steps,
         settled=settled,

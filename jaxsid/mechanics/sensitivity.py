@@ -73,10 +73,12 @@ class Marched(NamedTuple):
     Attributes:
         outputs: (samples, outputs, 1 + directions, windows) readings, then slopes.
         forces: (samples, slots, windows) of each effect at the sampling instants.
+        ends: (n, 1 + directions, windows) states at the sample that was asked for, then their slopes.
     """
 
     outputs: Float[Array, "samples outputs columns windows"]
     forces: Float[Array, "samples slots windows"]
+    ends: Float[Array, "n columns windows"]
 
 
 def prepared(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Array) -> Prepared:
@@ -139,6 +141,7 @@ class Windows(NamedTuple):
         dt: sampling interval, s.
         first: numbers of the first sample in the record.
         states: to begin with, n of the bodies' and effects' own.
+        end: number of the sample, from the start of a window, whose states are wanted.
     """
 
     u: Float[Array, "windows samples inputs"]
@@ -147,6 +150,7 @@ class Windows(NamedTuple):
     dt: Float[Array, ""]
     first: Int[Array, " windows"]
     states: Float[Array, "windows n"]
+    end: int
 
 
 class Laws(NamedTuple):
@@ -175,11 +179,15 @@ class _March(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """Of one sample: fields of `Late`, (5, inputs, windows), their slopes, (5, inputs, windows, p), its numbers."""
+    """Of one sample: fields of `Late`, (5, inputs, windows), their slopes, (5, inputs, windows, p), its numbers.
+
+    `last` is 1 where its states are wanted.
+    """
 
     inputs: Array
     moved: Array
     numbers: Array
+    last: Array
 
 
 class _At(NamedTuple):
@@ -212,8 +220,9 @@ def marched(own: Prepared, slopes: Prepared, laws: Laws, windows: Windows, subst
     # a speed that is nothing but rounding is rest
     speed, size = speeds @ states.T, 1e-12 * jnp.abs(speeds) @ jnp.abs(states.T)
     sliding = jnp.where(jnp.abs(speed) > size, jnp.sign(speed), 0.0)
-    rows = _Row(inputs, moved, windows.first + jnp.arange(len(inputs), dtype=Z.dtype)[:, None])
-    _, (read, after, forces) = lax.scan(partial(_sample, march), (Z, sliding), rows)
+    numbers = jnp.arange(len(inputs))
+    rows = _Row(inputs, moved, windows.first + numbers[:, None].astype(Z.dtype), numbers == windows.end)
+    (*_, ends), (read, after, forces) = lax.scan(partial(_sample, march), (Z, sliding, Z), rows)
     direct = _columns(
         lambda x: _direct(*x), (own.direct, own.part, inputs), (slopes.direct, slopes.part, moved)
     )
@@ -225,13 +234,13 @@ def marched(own: Prepared, slopes: Prepared, laws: Laws, windows: Windows, subst
         outputs = jnp.take_along_axis(outputs, jnp.maximum(at, 0)[:, :, None, None], axis=0)
         outputs = jnp.where((at < 0)[:, :, None, None], rest, outputs)
     offset = jnp.concatenate([own.offset[:, None], slopes.offset], axis=1)
-    return Marched(outputs + _wide(offset[:, :, None], n), forces)
+    return Marched(outputs + _wide(offset[:, :, None], n), forces, ends)
 
 
 def _sample(march: _March, carry: tuple, row: _Row) -> tuple[tuple, tuple]:
     """From one sampling instant to the next, and what is read there."""
     own, slopes, (kinds, *_) = march[:3]
-    (Z, sliding), count = carry, len(kinds)
+    (Z, sliding, ends), count = carry, len(kinds)
     none = jnp.zeros((2 * count, *Z.shape[1:]), Z.dtype)
     begin = _At(Z, sliding, none, none)
     end = lax.fori_loop(0, march.substeps, lambda i, at: _substep(march, row, i, at), begin)
@@ -249,7 +258,7 @@ def _sample(march: _March, carry: tuple, row: _Row) -> tuple[tuple, tuple]:
     else:
         read = _through(own.read, slopes.read, jnp.concatenate([Z, end.mean, begun]))
         after = _through(own.after, slopes.after, begun)
-    return (end.Z, end.sliding), (read, after, begun[:count, 0])
+    return (end.Z, end.sliding, jnp.where(row.last, Z, ends)), (read, after, begun[:count, 0])
 
 
 def _substep(march: _March, row: _Row, i: Array, at: _At) -> _At:
