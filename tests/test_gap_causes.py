@@ -23,10 +23,10 @@ from jaxsid.gap.explain import (
     extended,
     key_of,
 )
+from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
-from jaxsid.gap.shooting import Fit
 from jaxsid.gap.verdict import verdict_of
 from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_model, second_order
 from jaxsid.physical.elements import element_matrices

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsid.gap.fit import Prior, fitted
 from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import FIXED, Bench, Refit
 from jaxsid.gap.resume import step
-from jaxsid.gap.shooting import Prior, fitted, products_of
+from jaxsid.gap.shooting import products_of
 from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.records import Record

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxsid.gap.fit import GAIN, STEPS, Fit, Prior, fitted
 from jaxsid.gap.hypothesis import (
     Moved,
     amplitudes_of,
@@ -21,7 +22,7 @@ from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
-from jaxsid.gap.shooting import GAIN, STEPS, Fit, Prior, Products, Shot, fitted, parameters_of, products_of
+from jaxsid.gap.shooting import Products, Shot, parameters_of, products_of
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
