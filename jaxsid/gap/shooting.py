@@ -3,7 +3,7 @@
 Multiple shooting (H. Bock, 1983): no window is long enough for a wrong start to lead astray, and none shorter than a
 few vibrations. One compiled program prepares the linear part for effects of all sorts; another gives, for a block of
 windows of fixed size, all products of residuals and slopes that a step of Gauss and Newton needs, and knows kinds of
-effects by their sorts only. The search itself runs outside: few programs serve all candidates and records of any length.
+effects by their sorts only. The search itself runs outside, so that few programs serve records of any length.
 """
 
 from collections.abc import Sequence
