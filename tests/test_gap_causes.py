@@ -181,7 +181,7 @@ def test_a_further_effect_must_be_worth_it():
     assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
     assert not worth(0.99 * WORTH * TEMPERATURE, 210.0)
     assert not worth(1e4, 190.0)  # of the 2000 above the noise less than a tenth
-    assert not worth(1e4, 15.0, before=1000.0)  # there is nothing but noise, of which less than 2 %
+    assert not worth(1e4, 9.0, before=1000.0)  # there is nothing but noise, of which less than 1 %
     assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
     assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
 

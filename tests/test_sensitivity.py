@@ -38,7 +38,7 @@ PAIRS = [
     ("input_delay", "coulomb_friction"),
     ("missing_mode", "end_stop"),
 ]
-LEAD, LENGTH, WINDOWS, SUBSTEPS = 8, 40, 3, 2
+LEAD, LENGTH, WINDOWS, SUBSTEPS, END = 8, 40, 3, 2, 29
 
 
 def effect(kind, place=None):
@@ -56,7 +56,7 @@ def case(kinds):
     slots = effect_slots(chain(), effects)
     n = 2 * (3 + slots.count)
     states = jnp.asarray(rng.standard_normal((WINDOWS, n)) * np.where(np.arange(n) < 3, 1e-3, 0.03))
-    windows = Windows(u, jnp.asarray([False]), LEAD, jnp.asarray(DT), jnp.asarray([0, 50, 700]), states)
+    windows = Windows(u, jnp.asarray([False]), LEAD, jnp.asarray(DT), jnp.asarray([0, 50, 700]), states, END)
     return second_order(chain()), slots, windows
 
 
@@ -70,7 +70,7 @@ def moved(linear, slots, theta):
 
 
 def one_by_one(linear, slots, windows, theta):
-    """(windows, samples, outputs, 1 + directions) readings and slopes by plain differentiation."""
+    """Readings, (windows, samples, outputs, 1 + directions), states likewise, forces, by plain differentiation."""
 
     def readings(theta, state, u, first):
         changed = moved(linear, slots, theta)
@@ -78,11 +78,13 @@ def one_by_one(linear, slots, windows, theta):
         late = forced(system, changed[1], u, windows.ramps, windows.dt)
         late = late._replace(**{k: getattr(late, k)[LEAD:] for k in late._fields[:4]})
         found = respond_to(system, changed[1], late, windows.dt, state, SUBSTEPS, first)
-        return found.outputs, found
+        both = found.outputs, found.states[END]
+        return both, (both, found.forces)
 
     def window(state, u, first):
-        slopes, found = jax.jacfwd(readings, (0, 1), has_aux=True)(theta, state, u, first)
-        return jnp.concatenate([found.outputs[..., None], *slopes], axis=-1), found.forces
+        slopes, (both, forces) = jax.jacfwd(readings, (0, 1), has_aux=True)(theta, state, u, first)
+        whole = (jnp.concatenate([x[..., None], *s], axis=-1) for x, s in zip(both, slopes, strict=True))
+        return *whole, forces
 
     return jax.jit(jax.vmap(window))(windows.states, windows.u, windows.first)
 
@@ -108,10 +110,12 @@ def test_marching_all_windows_is_differentiating_each(kinds):
     linear, slots, windows = case(kinds)
     theta = jnp.zeros(2 + slots.parameters.size)
     found = all_at_once(linear, slots, windows, theta)
-    readings, forces = one_by_one(linear, slots, windows, theta)
+    readings, ends, forces = one_by_one(linear, slots, windows, theta)
     own = np.moveaxis(np.asarray(found.outputs), -1, 0)
     size = np.abs(readings).max(axis=(0, 1, 2))
     assert (size > 0).sum() > 8
     size = np.where(size > 0, size, 1.0)
     np.testing.assert_allclose(own / size, readings / size, atol=1e-9)
+    size = np.maximum(np.abs(ends).max(axis=0), 1e-9)
+    np.testing.assert_allclose(np.moveaxis(np.asarray(found.ends), -1, 0) / size, ends / size, atol=1e-9)
     np.testing.assert_allclose(np.moveaxis(np.asarray(found.forces), -1, 0), forces, rtol=1e-9, atol=1e-12)

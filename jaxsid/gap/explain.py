@@ -176,7 +176,7 @@ def rank(
     top = _value(rough[0][1], bench) if rough else 0.0
     done: dict[int, Refit] = {}
     if rough:
-        say("level and colour of the noise")
+        say(f"{rough[0][0].kind} at {_label(rough[0][0].place)}, thoroughly")
         bench, done[0], more = _weighed(bench, rough[0][1], effort)
         ratio = ratio * more
         without = refitted(bench, base, **_from(without, bench))
