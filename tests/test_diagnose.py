@@ -187,6 +187,7 @@ def test_the_command(tmp_path):
     assert not (tmp_path / "b").exists()
 
 
+@pytest.mark.slow
 def test_what_must_be_known_is_said(monkeypatch):
     monkeypatch.setattr(
         module, "causes_of", lambda *given, **more: None

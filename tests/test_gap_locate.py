@@ -41,6 +41,7 @@ def test_place_is_found_with_all_sensors(kind, place, parameters, expected):
     assert found.ranked[0].across < 1.5
 
 
+@pytest.mark.slow
 def test_place_is_found_with_one_sensor():
     u, y = measured(*CUBIC)
     kinds = SENSED[2:]

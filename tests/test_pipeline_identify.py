@@ -226,6 +226,7 @@ def test_two_sampling_rates_without_noise_are_exactly_one_system(model):
     check(identify(model, records), SYSTEM, Limits(1e-8, 1e-7, 1e-7, 1e-6))
 
 
+@pytest.mark.slow
 def test_a_roving_sensor(model):
     records = []
     for i in range(3):
@@ -365,6 +366,7 @@ def unstable_record(seed=0):
     return u, y + 0.01 * y.std() * rng.standard_normal(len(y)), np.linalg.eigvals(A)
 
 
+@pytest.mark.slow
 def test_an_unstable_system_keeps_its_pole_and_is_said_to_be_unstable():
     u, y, truth = unstable_record()
     model = lumped_model(

@@ -61,11 +61,13 @@ def test_nearly_every_start_within_thirty_percent_converges(name, sensed):
     assert good >= 95
 
 
+@pytest.mark.slow
 def test_one_sensor_is_enough_for_a_chain():
     ir = exact_response(chain_model(THREE, sensed=(0,)))
     assert relative(refine(wrong(3, sensed=(0,)), ir)) < 1e-8
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_the_errors_whether_the_noise_is_known_or_not():
     known = IndependentNoise(jnp.asarray(SIZE**2))
     for noise in (None, known):
@@ -197,6 +199,7 @@ def test_traced_and_mapped_it_is_the_same_fit():
         np.testing.assert_allclose(mapped_std[seed], alone.deviation, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_solvers_of_optimistix_come_to_the_same_place():
     import optimistix
 
@@ -226,6 +229,7 @@ def recorded(seed, model, outputs=(0, 1, 2)):
     return Record(u, y[:, outputs], 1e-3, inputs=["f1"], outputs=names)
 
 
+@pytest.mark.slow
 def test_raw_records_with_residuals_that_are_noise():
     found = refine(wrong(6), recorded(6, None))
     assert np.abs(pulls(found)).max() < 4
@@ -287,6 +291,7 @@ def test_what_cannot_be_used_is_told():
         refine(model, Record(np.ones((100, 1)), np.ones((100, 1)), 1e-3, inputs=["f1"], outputs=["s9"]))
 
 
+@pytest.mark.slow
 def test_a_value_on_which_nothing_depends_is_told():
     """A body that a zero spring leaves alone."""
     from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model

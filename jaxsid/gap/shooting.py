@@ -19,8 +19,7 @@ from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
 from jaxsid.mechanics.effects.catalogue import Sorted
-from jaxsid.mechanics.sensitivity import Laws, Windows, marched, prepared
-from jaxsid.mechanics.sensitivity import Prepared as LinearPart
+from jaxsid.mechanics.sensitivity import Laws, LinearPart, Windows, linear_part, marched
 from jaxsid.mechanics.slots import Slots
 from jaxsid.physical.motion import counted
 from jaxsid.records import SecondOrderModel
@@ -64,7 +63,7 @@ class Prepared(eqx.Module):
     """A hypothesis with its unknowns, ready for windows: of the linear part and the parameters, values and slopes.
 
     Attributes:
-        own, slopes: the linear part, from `sensitivity.prepared`, and by the unknowns, the last axis.
+        own, slopes: the linear part, from `linear_part`, and by the unknowns, the last axis.
         parameters: (records, slots, most).
         parameter_slopes: (records, slots, most, p).
         kinds: of the effects.
@@ -93,17 +92,17 @@ def ready(shot: Shot, theta: Array, dt: Array, records: int, substeps: Array) ->
     kinds = shot.slots.kinds
     assert isinstance(kinds, Sorted)
     plain = eqx.tree_at(lambda s: s.slots.kinds, shot, kinds.numbers)
-    own, slopes, *parameters = _linear_part(plain, theta, dt, records, substeps)
+    own, slopes, *parameters = _with_slopes(plain, theta, dt, records, substeps)
     return Prepared(own, slopes, parameters[0], parameters[1], kinds, substeps)
 
 
 @compiled_in_full
-def _linear_part(shot: Shot, theta: Array, dt: Array, records: int, substeps: Array) -> tuple[Any, ...]:
+def _with_slopes(shot: Shot, theta: Array, dt: Array, records: int, substeps: Array) -> tuple[Any, ...]:
     def of(theta: Array) -> tuple[LinearPart, Array]:
         # but for phases of periodic laws parameters are the same in all records
         every = jnp.stack([parameters_of(shot, theta, i) for i in range(records)])
         slots = eqx.tree_at(lambda s: s.parameters, shot.slots, every[0])
-        return prepared(matrices_of(shot, theta), slots, dt, substeps), every
+        return linear_part(matrices_of(shot, theta), slots, dt, substeps), every
 
     (own, every), (slopes, every_slopes) = of(theta), jax.jacfwd(of)(theta)
     return own, slopes, every, every_slopes

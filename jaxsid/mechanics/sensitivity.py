@@ -27,7 +27,7 @@ from jaxsid.mechanics.slots import Slots
 from jaxsid.records import SecondOrderModel
 
 
-class Prepared(NamedTuple):
+class LinearPart(NamedTuple):
     """All that a march needs of the linear part, or its slopes, with their directions as the last axis.
 
     Attributes:
@@ -81,7 +81,7 @@ class Marched(NamedTuple):
     ends: Float[Array, "n columns windows"]
 
 
-def prepared(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Array) -> Prepared:
+def linear_part(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Array) -> LinearPart:
     """The linear part for steps of one length.
 
     Args:
@@ -112,7 +112,7 @@ def prepared(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Array)
     direct = jnp.stack([one[:, ports:], two[:, ports:], system.D], axis=1)
     now, after = (x[:, None] * system.F for x in (1 - part, part))
     gain = (1 + change.gain @ slots.sensors)[:, None]
-    return Prepared(
+    return LinearPart(
         step.linear,
         jnp.stack([jnp.concatenate(x, axis=1) for x in of_stages]),
         jnp.concatenate([start, half, half, end], axis=1),
@@ -170,8 +170,8 @@ class Laws(NamedTuple):
 class _March(NamedTuple):
     """What stays the same on the way: linear part, its slopes, the effects, times, what speeds are of the state."""
 
-    own: Prepared
-    slopes: Prepared
+    own: LinearPart
+    slopes: LinearPart
     laws: Laws
     dt: Array
     substeps: Array
@@ -199,15 +199,15 @@ class _At(NamedTuple):
     begun: Array
 
 
-def marched(own: Prepared, slopes: Prepared, laws: Laws, windows: Windows, substeps: Array) -> Marched:
+def marched(own: LinearPart, slopes: LinearPart, laws: Laws, windows: Windows, substeps: Array) -> Marched:
     """Readings of a model with effects in all windows, with slopes by p unknowns and by the initial states.
 
     Args:
-        own: the linear part, from `prepared`.
+        own: the linear part, from `linear_part`.
         slopes: its slopes by the unknowns.
         laws: the effects.
         windows: inputs and initial states.
-        substeps: steps for each sampling interval, as of `prepared`.
+        substeps: steps for each sampling interval, as of `linear_part`.
     """
     kinds, states = laws.kinds, windows.states
     (n, count), p = (states.shape[1], len(kinds)), slopes.part.shape[-1]
