@@ -8,8 +8,9 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -118,6 +119,7 @@ def identify(
 
         nominal = read_model(model)
         measured = read_records(records, nominal)
+        _load_meanwhile("pandas", "jaxsid.report.html", "jaxsid.report.identification_page")
         found = run(
             nominal,
             measured,
@@ -386,6 +388,17 @@ def _method(choice: Method, records, say):
     return {Method.fourier: Fourier, Method.direct: Direct, Method.wavelet: Wavelet}[choice]()
 
 
+def _load_meanwhile(*modules: str) -> None:
+    """Load what is needed later while the main thread waits for results: a second of a warm run."""
+
+    def load() -> None:
+        for name in modules:
+            with suppress(ImportError):  # said where it is needed
+                import_module(name)
+
+    threading.Thread(target=load, daemon=True).start()
+
+
 def _write(found, out: Path, say, later: str | None = None) -> None:
     """All files, or none."""
     from jaxsid.files.atomic import atomic_directory
@@ -425,6 +438,8 @@ def _write_diagnosis(found, out: Path, say) -> None:
         if found.experiment is not None:
             write_record(found.experiment.record, draft / "next_input.csv")
         write_diagnosis_report(found, draft / "report.html")
+    if found.experiment is None:
+        (out / "next_input.csv").unlink(missing_ok=True)  # of an older run
 
 
 def _summary(found, out: Path) -> None:

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 from gap_helpers import DT, SAMPLES, chain, drive, exact, record
 
-from jaxsid.gap.hypothesis import Moved
+from jaxsid.gap.hypothesis import FIXED, Moved
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import FIXED, Bench
+from jaxsid.gap.refit import Bench
 from jaxsid.gap.setting import slowest_rate
 from jaxsid.gap.windows import blocks_of, window_length
 from jaxsid.mechanics.lumped import second_order

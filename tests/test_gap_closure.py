@@ -10,8 +10,8 @@ import jaxsid
 from jaxsid.gap import closure as module
 from jaxsid.gap.closure import HELD_OUT, Left, closure_of, fraction, held_out_begin, left_of, seen_part
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
-from jaxsid.gap.hypothesis import parameter_rows
-from jaxsid.gap.refit import FIXED, Hypothesis, refitted, shot_of
+from jaxsid.gap.hypothesis import FIXED, parameter_rows
+from jaxsid.gap.refit import Hypothesis, refitted, shot_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
 

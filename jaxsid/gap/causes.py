@@ -24,6 +24,7 @@ from jaxsid.gap.explain import (
     key_of,
     rank,
 )
+from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
@@ -31,7 +32,6 @@ from jaxsid.gap.null import Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import (
-    FIXED,
     Bench,
     Hypothesis,
     Refit,

@@ -46,20 +46,16 @@ class Chain(NamedTuple):
         right = right / scale[:, :, None]
         before, after = self.links
         ahead = self.ahead / scale[before][:, :, None] / scale[after][:, None, :]
-        if not len(before):
-            found = np.linalg.solve(own, right)
-        else:
-            own, found = own.copy(), right.copy()
-            # windows stand in the order of time, so that each link is used before the next
-            kept = []
-            for link in np.argsort(after, kind="stable"):
-                i, j = before[link], after[link]
-                back = np.linalg.solve(own[i], ahead[link])
-                own[j] -= ahead[link].T @ back
-                found[j] -= back.T @ found[i]
-                kept.append((i, j, back))
-            found = np.linalg.solve(own, found)
-            for i, j, back in reversed(kept):
-                found[i] -= back @ found[j]
+        # windows stand in the order of time, so that each link is used before the next
+        kept = []
+        for link in np.argsort(after, kind="stable"):
+            i, j = before[link], after[link]
+            back = np.linalg.solve(own[i], ahead[link])
+            own[j] -= ahead[link].T @ back
+            right[j] -= back.T @ right[i]
+            kept.append((i, j, back))
+        found = np.linalg.solve(own, right)
+        for i, j, back in reversed(kept):
+            found[i] -= back @ found[j]
         determinant = 2 * np.log(scale).sum() + np.linalg.slogdet(own)[1].sum()
         return found / scale[:, :, None], float(determinant)

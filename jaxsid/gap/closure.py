@@ -8,8 +8,9 @@ from jaxtyping import Array, Float
 
 from jaxsid.gap.fit import Prior, fitted
 from jaxsid.gap.free_run import Run, free_run
+from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import FIXED, Bench, Refit
+from jaxsid.gap.refit import Bench, Refit
 from jaxsid.gap.resume import step
 from jaxsid.gap.shooting import products_of
 from jaxsid.gap.windows import Block, blocks_of
@@ -146,10 +147,8 @@ def _states(
 ) -> tuple[np.ndarray, ...]:
     """Initial states of windows, all else as it is."""
     theta = found.fit.theta
-    size = len(bench.still) // 2
-    hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], found.shot.slots.count)
     same = np.full(len(theta), FIXED)
-    states = np.concatenate([bench.still, hidden])
+    states = bench.state_deviations(found.shot.slots.count)
     least, most = np.full(len(theta), -np.inf), np.ones(len(theta))
     prior = Prior(same, theta, least, most, states, np.full(len(states), np.inf))
     begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]

@@ -77,8 +77,7 @@ def fitted(
     steps: int = STEPS,
     gain: float = GAIN,
 ) -> Fit:
-    """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated window by
-    window.
+    """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated.
 
     Args:
         shot: the hypothesis.

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxsid.gap.fit import GAIN, STEPS, Fit, Prior, fitted
 from jaxsid.gap.hypothesis import (
+    FIXED,
     Moved,
     amplitudes_of,
     coordinates_of,
@@ -32,7 +33,6 @@ from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
 
-FIXED = 1e-9  # deviation of what does not vary
 MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
 LEAST_ELEMENT = -0.95
@@ -70,6 +70,16 @@ class Bench(NamedTuple):
     substeps: int
     noises: tuple[Noise, ...]
     jump: float = np.inf
+
+    def state_deviations(self, slots: int) -> Float[np.ndarray, " m"]:
+        """Of all states at the start of a window; an effect's own is about as large as what moves there.
+
+        Args:
+            slots: of effects, each with a displacement and a velocity of its own.
+        """
+        size = len(self.still) // 2
+        own = np.repeat([self.still[:size].max(), self.still[size:].max()], slots)
+        return np.concatenate([self.still, own])
 
     def part(self, blocks: int) -> "Bench":
         """The same with some blocks only, from all along the records.
@@ -319,10 +329,7 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
         ]
     )
     most = np.where(np.arange(len(deviation)) < len(elements), MOST_ELEMENT, MOST_UNKNOWN)
-    size = len(bench.still) // 2
-    # an effect's own state is about as large as what moves there
-    hidden = np.repeat([bench.still[:size].max(), bench.still[size:].max()], shot.slots.count)
-    states = np.concatenate([bench.still, hidden])
+    states = bench.state_deviations(shot.slots.count)
     return Prior(deviation, np.zeros(len(deviation)), least, most, states, bench.jump * states / LARGE)
 
 
