@@ -240,7 +240,7 @@ def values_of(model, u, **parameters):
         ),
         pytest.param("backlash", JOINT, {"half_gap": 0.002}, marks=pytest.mark.slow),
         pytest.param("input_delay", 0, {"delay": 0.0034}, marks=pytest.mark.slow),
-        ("sensor_lag", 0, {"time_constant": 0.004}),
+        pytest.param("sensor_lag", 0, {"time_constant": 0.004}, marks=pytest.mark.slow),
         pytest.param(
             "missing_mode", 1, {"mass": 0.2, "stiffness": 300.0, "damping": 0.5}, marks=pytest.mark.slow
         ),
