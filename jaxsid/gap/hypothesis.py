@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsid.mechanics.amplitudes import amplitudes
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS, by_sort, kind_number
 from jaxsid.mechanics.effects.prior import Amplitudes, Prior
-from jaxsid.mechanics.lumped import Effect, LumpedModel
+from jaxsid.mechanics.lumped import Effect, LumpedModel, with_effects
 from jaxsid.mechanics.slots import Slots, slots_of
 from jaxsid.records import SecondOrderModel
 
@@ -113,9 +113,7 @@ def effect_slots(model: LumpedModel, effects: Sequence[Effect]) -> Slots:
         model: names bodies, sensors and inputs.
         effects: of the hypothesis.
     """
-    slots = slots_of(
-        eqx.tree_at(lambda m: m.effects, model, tuple(effects), is_leaf=lambda x: x is model.effects)
-    )
+    slots = slots_of(with_effects(model, effects))
     if not effects:
         one = lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype)  # noqa: E731
         slots = Slots(jnp.asarray([kind_number(INERT)], jnp.int32), *map(one, _arrays(slots)))

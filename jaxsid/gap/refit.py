@@ -28,7 +28,7 @@ from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
-from jaxsid.mechanics.lumped import Effect, LumpedModel, free_bodies, second_order
+from jaxsid.mechanics.lumped import Effect, LumpedModel, free_bodies, second_order, with_effects
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
@@ -146,7 +146,7 @@ def bench_of(
         noises: of each.
         refit: the best linear model beside the records.
     """
-    model = _without_effects(model)
+    model = with_effects(model, ())
     dt = min(float(r.dt) for r in records)
     longest = max(len(r.y) for r in records)
     # small disturbing forces drive a free axis away from any long simulation
@@ -192,10 +192,6 @@ def _substeps(model: LumpedModel, dt: float) -> int:
     rates = np.abs(np.linalg.eigvals(np.asarray(plain.A)).imag)
     quickest = min(float(rates.max(initial=0.0)), np.pi / dt)
     return int(np.clip(np.ceil(STEPS_A_PERIOD * quickest * dt / (2 * np.pi)), 1, MOST_SUBSTEPS))
-
-
-def _without_effects(model: LumpedModel) -> LumpedModel:
-    return eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda x: x is model.effects)
 
 
 def weighed_anew(bench: Bench, found: Refit) -> Bench:
@@ -353,14 +349,10 @@ def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Re
         deviations.append({n: float(deviation[row, i]) for i, n in enumerate(names)})
     nominal = np.asarray(element_matrices(bench.model).nominal)
     model = with_values(bench.model, jnp.asarray(nominal * (1 + fit.theta[:elements])))
-    model = _with_effects(model, tuple(found))
+    model = with_effects(model, found)
     return Refit(Hypothesis(tuple(found), hypothesis.wrong), fit, model, tuple(deviations), shot)
 
 
 def _slopes(shot: Shot, theta: np.ndarray) -> np.ndarray:
     """(slots * most, p) of the first record's parameters."""
     return np.asarray(jax.jacfwd(lambda t: parameters_of(shot, t, 0).ravel())(jnp.asarray(theta)))
-
-
-def _with_effects(model: LumpedModel, effects: tuple[Effect, ...]) -> LumpedModel:
-    return eqx.tree_at(lambda m: m.effects, model, effects, is_leaf=lambda x: x is model.effects)

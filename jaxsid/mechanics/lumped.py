@@ -181,6 +181,16 @@ def lumped_model(
     return model
 
 
+def with_effects(model: LumpedModel, effects: Sequence[Effect]) -> LumpedModel:
+    """A model with these effects in place of its own.
+
+    Args:
+        model: all else.
+        effects: as of `LumpedModel`.
+    """
+    return eqx.tree_at(lambda m: m.effects, model, tuple(effects), is_leaf=lambda x: x is model.effects)
+
+
 def check_lumped(model: LumpedModel) -> None:
     """Raise InputError where the names, shapes or values of a model cannot be used."""
     _check_names(model)

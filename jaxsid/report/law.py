@@ -1,6 +1,5 @@
 """The laws that a diagnosis chose, along the motion of a place: what the force there should have been."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -12,7 +11,7 @@ from jaxsid.gap.explain import ERRORS, element_place
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, parameter_row
 from jaxsid.mechanics.effects.kind import Kind, Motion, Nominal
-from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, second_order
+from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, second_order, with_effects
 from jaxsid.mechanics.slots import nominal_at, slots_of
 from jaxsid.physical.elements import element_matrices
 
@@ -69,7 +68,7 @@ def _sense(effect: Effect, ends: tuple[str, ...]) -> tuple[float, float] | None:
 def _along(
     model: LumpedModel, effect: Effect, force: ForceMap, sign: tuple[float, float]
 ) -> Float[np.ndarray, " samples"] | None:
-    bare = eqx.tree_at(lambda m: m.effects, model, (effect,), is_leaf=lambda x: x is model.effects)
+    bare = with_effects(model, (effect,))
     place, speed, time = (jnp.asarray(x) for x in (force.displacement, force.velocity, force.time))
     law, inertia = _force(bare, sign[0] * place, sign[0] * speed, time, force.record)
     return None if float(inertia) else sign[1] * np.asarray(law)
