@@ -131,6 +131,14 @@ class Diagnosis(NamedTuple):
             for x, value, std, nominal in zip(values.listed, *columns, strict=True)
         ]
 
+    def probability(self, x: Explanation) -> float:
+        """Of an explanation, next to all that were tried, to none, and to what is not in the catalogue.
+
+        Args:
+            x: of a round.
+        """
+        return x.probability * (1 - self.judgement.probability["unknown"])
+
     def effects(self) -> list[dict[str, Any]]:
         """Candidates of the rounds in which an effect was found, most probable first.
 
@@ -148,7 +156,7 @@ class Diagnosis(NamedTuple):
         return [
             {
                 **as_pair(x),
-                "probability": x.probability,
+                "probability": self.probability(x),
                 "parameters": self._parameters(x, x.refit),
                 "confusable_with": [
                     as_pair(y) for y in ranking.ranked if y.key != x.key and alike(x, y, ranking)

@@ -32,6 +32,7 @@ class Found(Protocol):
     def experiment(self) -> Experiment | None: ...
     @property
     def verdict(self) -> str: ...
+    def probability(self, x: Explanation) -> float: ...
     def selected(self) -> list[dict[str, Any]]: ...
 
 
@@ -110,7 +111,7 @@ def _sentence(found: Found, number: int) -> str:
     x = found.causes.selected[number]
     given = found.selected()[number]["parameters"]
     values = ", ".join(_value(name, p) for name, p in given.items())
-    return f"{named(x)} ({values}), probability {x.probability:.2f}"
+    return f"{named(x)} ({values}), probability {found.probability(x):.2f}"
 
 
 def _value(name: str, p: dict[str, Any]) -> str:
