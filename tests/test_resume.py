@@ -103,7 +103,7 @@ def test_a_killed_diagnosis_goes_on(tmp_path):
     y = with_effect(u, "cubic_stiffness", JOINT, {"coefficient": 1e6})
     y = y + 0.01 * y.std(axis=0) * np.random.default_rng(0).standard_normal(y.shape)
     model, data = tmp_path / "model.toml", tmp_path / "run.csv"
-    write_model(model, chain())
+    write_model(chain(), model)
     rows = np.column_stack([np.arange(len(u)) * 0.01, u, y])
     np.savetxt(data, rows, delimiter=",", header="time,drive,s0,s1,s2", comments="")
     call = [str(Path(sys.executable).with_name("jaxsid")), "diagnose", str(model), str(data), "--out"]
@@ -114,8 +114,7 @@ def test_a_killed_diagnosis_goes_on(tmp_path):
             time.sleep(0.1)
         running.send_signal(signal.SIGKILL)
     assert not (tmp_path / "cut").exists()
-    before = time.perf_counter(), len(list(parts.glob("*")))
-    assert before[1] >= 8
+    assert len(list(parts.glob("*"))) >= 8
     subprocess.run([*call, str(tmp_path / "cut"), "--resume"], check=True)
     assert not parts.exists()
     found = [json.loads((tmp_path / x / "diagnosis.json").read_text()) for x in ("whole", "cut")]
