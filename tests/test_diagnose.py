@@ -13,6 +13,7 @@ from jaxsid.cli import app
 from jaxsid.files.results_json import plain
 from jaxsid.gap import diagnose as module
 from jaxsid.gap.explain import element_place
+from jaxsid.gap.verdict import LAPSE
 from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
 from jaxsid.physical.elements import Element, element_matrices
 from jaxsid.report.diagnosis_page import diagnosis_page
@@ -59,10 +60,10 @@ def test_a_missing_law_is_named_with_its_place_and_coefficient(cubic, written):
 def test_probabilities_are_those_of_the_candidates(written):
     assert set(written["verdict_probability"]) == {"none", "effect", "unknown"}
     assert sum(written["verdict_probability"].values()) == pytest.approx(1)
-    assert written["verdict_probability"]["effect"] > 0.95
+    assert written["verdict_probability"]["effect"] == pytest.approx(1 - LAPSE, abs=5e-3)
     first, *others = written["effects"]
     assert {key: first[key] for key in LAW} == LAW
-    assert first["probability"] > 0.99
+    assert first["probability"] == pytest.approx(1 - LAPSE, abs=5e-3)
     assert first["confusable_with"] == []
     assert len(others) >= 5
     assert sum(x["probability"] for x in written["effects"]) <= 1 + 1e-9

@@ -27,7 +27,7 @@ from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
-from jaxsid.gap.verdict import verdict_of
+from jaxsid.gap.verdict import LAPSE, verdict_of
 from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_model, second_order
 from jaxsid.physical.elements import element_matrices
 
@@ -250,7 +250,7 @@ def test_effect():
     found = verdict_of(examination(), causes(ranking(0.0, -200.0), closures=[closure(0.012)]))
     assert found.name == "effect"
     assert [[x.kind for x in likely] for likely in found.likely] == [["cubic_stiffness"]]
-    assert found.probability["effect"] > 0.99
+    assert found.probability["effect"] == pytest.approx(1 - LAPSE, abs=5e-3)
     assert sum(found.probability.values()) == pytest.approx(1)
 
 

@@ -13,6 +13,7 @@ from jaxsid.gap.null import left_share
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
+LAPSE = 0.04  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
 
 class Verdict(NamedTuple):
@@ -58,12 +59,12 @@ def _slight(found: Examination) -> bool:
 
 
 def _unexplained(causes: Causes) -> float:
-    """Probability that the law is not in the catalogue: by how much of the gap the best one leaves."""
+    """Probability that the law is not among those tried: by how much of the gap the best one leaves."""
     last = causes.closures[-1]
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1.0
     gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
-    return float(1 / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
+    return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
 
 
 def _substantial(gap: float, floor: float) -> bool:
