@@ -95,11 +95,17 @@ def first_is_right(case: Scored) -> bool:
     return any(among(case, i, 1) for i in range(len(case.label["effects"])))
 
 
+def first_set(case: Scored) -> list[dict[str, Any]]:
+    """The most probable place, with those that it is not told apart from."""
+    first = (case.found.get("locations") or [])[:1]
+    return [x for y in first for x in y["together"]]
+
+
 def unknown_found(case: Scored) -> bool:
-    """Called unknown, and at its place; of a Hertz contact, or explained there nearly wholly."""
+    """Called unknown, and its place in the first set; of a Hertz contact, or explained there nearly wholly."""
     place = lambda x: same_place(case.label, 0, x["place"])  # noqa: E731
     if case.verdict == "unknown":
-        return any(place(x) for x in (case.found.get("locations") or [])[:1])
+        return any(same_place(case.label, 0, x) for x in first_set(case))
     hertz = case.label["effects"][0]["kind"] == "hertz_contact"
     chosen = case.found.get("selected") or []
     closed = (case.found.get("closure") or {}).get("fraction") or 0.0
@@ -233,6 +239,7 @@ def scored(rows: list[Scored]) -> dict[str, Any]:
         "noise_5_percent_first": share([c for c in several if c.label["noise"] == 0.05], first),
         "false_alarms": share(none, lambda c: c.verdict != "none"),
         "unknown_at_place": share(unknown, unknown_found),
+        "unknown_set": float(np.mean([len(first_set(c)) for c in unknown])) if unknown else None,
         "unknown_recall": share(unknown, lambda c: c.verdict == "unknown"),
         "false_unknown": share(single + double, lambda c: c.verdict == "unknown"),
         "missed": share(single + double, lambda c: c.verdict == "none"),
@@ -289,6 +296,7 @@ def table(found: dict[str, Any]) -> str:
     closure, seconds = found["closure"], found["seconds"]
     lines += [
         f"| expected calibration error | {number(found['calibration']['error'])} | at most 0.05 |",
+        f"| places in the first set, outside the catalogue, mean | {number(found['unknown_set'])} | |",
         f"| closure against an oracle, median / lowest tenth | {number(closure['median'])} / "
         f"{number(closure['lowest_tenth'])} | 0.98 / 0.90 |",
         f"| time of a diagnosis, median / worst, s | {number(seconds['median'])} / {number(seconds['worst'])} | 45 |",

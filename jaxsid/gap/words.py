@@ -166,6 +166,9 @@ def next_experiment(found: Found) -> str:
     open_ones = [likely for likely in found.judgement.likely if len(likely) > 1]
     if open_ones:
         kinds = {x.kind for x in open_ones[0]}
+        if len(kinds) == 1:
+            open_places = " or ".join(place_words(x.place) for x in open_ones[0])
+            return f"A longer record, or one more sensor: only the place is open, {open_places}."
         if kinds & {"input_delay", "actuator_lag", "input_gain", "actuator_saturation"}:
             return "What enters by a sensor of its own: it tells an error of the input from all else."
         if kinds & {"coulomb_friction", "stribeck_friction", "quadratic_damping"}:
