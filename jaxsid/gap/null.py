@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
 
+from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
@@ -63,7 +64,8 @@ def null_test(fit: Recalibrated, places: Sequence[Place]) -> Null:
 
     Source: S. Holm, Scand. J. Statistics 6 (1979).
     """
-    tests = [*_laws(fit, tuple(places)), _lone_line(fit)]
+    leveled = tuple(_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True))
+    tests = [*_laws(fit, leveled, tuple(places)), _lone_line(fit), *_steady(fit, leveled)]
     if all(n.degrees > 0 for n in fit.noises):
         tests.append(_power(fit))
     worst = min(tests, key=lambda t: t.p_value)
@@ -84,7 +86,7 @@ def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
     return float(gammaincc(len(within.change) / 2, ratio / 2))
 
 
-def _laws(fit: Recalibrated, places: tuple[Place, ...]) -> list[Test]:
+def _laws(fit: Recalibrated, settings: tuple[Setting, ...], places: tuple[Place, ...]) -> list[Test]:
     """An F test for the shapes of each place."""
     ports, count = ports_of(fit.model, places), len(places)
     spread = lambda m: jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), m)  # noqa: E731
@@ -92,7 +94,6 @@ def _laws(fit: Recalibrated, places: tuple[Place, ...]) -> list[Test]:
     sizes = [extents(s, ports, m) for s, m in zip(fit.settings, motions, strict=True)]
     size = together(sizes)
     none = Force(jnp.zeros((count, 1)), jnp.ones((count, 1)))
-    settings = [_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True)]
     parts = [tables(s, ports, Guess(m, size), none) for s, m in zip(settings, motions, strict=True)]
     gram = np.sum([np.asarray(x.gram)[:, 0] for x in parts], axis=0)
     elements = len(fit.change)
@@ -121,6 +122,16 @@ def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit
     p = float(betainc(rest / 2, rank / 2, rest / (rest + rank * ratio)))
     excess = max(explained - (total - explained) * rank / rest, 0.0) / total
     return Test(name, p, np.sqrt(excess) * left_share(fit))
+
+
+def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
+    """An F test for steady forces on free bodies, where there are such."""
+    found = balance_of(fit, settings)
+    if found is None:
+        return []
+    rest = max(fit.equations - len(fit.change) - sum(len(s.transient) for s in settings), 1)
+    p = float(betainc(rest / 2, found.count / 2, rest / (rest + found.count * found.statistic)))
+    return [Test("steady force on free bodies", p, found.share)]
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:
