@@ -48,7 +48,7 @@ from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
-WORTH = 3.0  # tempered gain of evidence from which on a further effect is taken
+WORTH = 6.0  # tempered gain of evidence from which on a further effect is taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 PLACES = 2  # of one kind that are tried before other kinds, where something was found already

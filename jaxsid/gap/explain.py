@@ -19,13 +19,13 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.physical.elements import Element, element_matrices
 
-TEMPERATURE = 10.0  # of effects: what no law has decides more than noise
-MILD = 4.0  # of the model's numbers, whose equations are known
+TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
+MILD = 2.0  # of the model's numbers, whose equations are known
 ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 3, 1  # laws of many numbers take longer to be found
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
-CLOSE = 20.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
+CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
 
