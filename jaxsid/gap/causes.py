@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.deflate import deflated
-from jaxsid.gap.examine import NEGLIGIBLE, SIGNIFICANT, Examination
+from jaxsid.gap.examine import NEGLIGIBLE, Examination
 from jaxsid.gap.explain import (
     ERRORS,
     FIRST,
@@ -28,7 +28,7 @@ from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.null import Null, null_test
+from jaxsid.gap.null import SIGNIFICANT, Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import (

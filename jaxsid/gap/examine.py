@@ -11,7 +11,7 @@ from jaxsid.checks import require
 from jaxsid.gap.locate import Locations, Scored, located, scored
 from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
-from jaxsid.gap.null import Null, null_test, tolerance_test
+from jaxsid.gap.null import SIGNIFICANT, Null, null_test, tolerance_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
 from jaxsid.gap.spectra import in_time
@@ -19,7 +19,6 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.records import Record, as_array
 
-SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
 FAR = 10.0  # times less that a refit leaves, from which on the tolerance may be wrong
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 

@@ -22,8 +22,10 @@ from jaxsid.gap.recalibrate import Linear, Recalibrated
 from jaxsid.gap.scoring import together
 from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion
-from jaxsid.impulse.lines import NEIGHBOURS, line_level
+from jaxsid.impulse.lines import line_level
 
+SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
+GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
 
@@ -46,7 +48,7 @@ class Null(NamedTuple):
 
     Attributes:
         p_value: of all tests together, by Holm's rule.
-        share: rms of what the strongest test found, next to that of the response.
+        share: rms of the most that any test found for certain, next to that of the response.
         tests: each alone.
     """
 
@@ -69,7 +71,8 @@ def null_test(fit: Recalibrated, places: Sequence[Place]) -> Null:
     if all(n.degrees > 0 for n in fit.noises):
         tests.append(_power(fit))
     worst = min(tests, key=lambda t: t.p_value)
-    return Null(min(1.0, worst.p_value * len(tests)), worst.share, tuple(tests))
+    share = max(t.share for t in tests if t is worst or t.p_value * len(tests) < SIGNIFICANT)
+    return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests))
 
 
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
@@ -154,19 +157,28 @@ def left_share(fit: Recalibrated) -> float:
 
 
 def _lone_line(fit: Recalibrated) -> Test:
-    """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees."""
-    around, every = np.ones(2 * NEIGHBOURS + 1), []
-    around[NEIGHBOURS] = 0.0
+    """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees.
+
+    Lines are those of Hann's window, so that a frequency between two of them has no skirts; of those around it the
+    nearest are left out, and of the others every second, which share nothing.
+    """
+    apart = np.abs(np.arange(-AROUND, AROUND + 1))
+    around, every = ((apart >= GUARD) & (apart % 2 == GUARD % 2)).astype(float), []
     for setting, linear in zip(fit.settings, fit.linear, strict=True):
         used = np.asarray(setting.spectra.weight) == 1
-        power = np.abs(np.asarray(linear.left) * np.asarray(setting.scale))[used] ** 2
-        power = power[:, np.asarray(setting.spectra.present) > 0]
-        smooth = lambda x: np.stack([np.convolve(c, around, mode="same") for c in x.T], axis=1)  # noqa: E731
-        every.append(np.stack([power, smooth(power), smooth(np.ones_like(power))]).reshape(3, -1))
-    power, others, count = np.concatenate(every, axis=1)
+        left = np.asarray(linear.left)[used][:, np.asarray(setting.spectra.present) > 0]
+        lines = left * np.asarray(setting.scale)[used][:, np.asarray(setting.spectra.present) > 0]
+        power = np.abs(lines - (np.roll(lines, 1, axis=0) + np.roll(lines, -1, axis=0)) / 2) ** 2
+        sums = lambda x, which: np.stack([np.convolve(c, which, mode="same") for c in x.T], axis=1)  # noqa: E731
+        # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
+        whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
+        part = sums(np.abs(left) ** 2, np.ones(2 * GUARD - 1)) / whole
+        columns = power, sums(power, around), sums(np.ones_like(power), around), part
+        every.append(np.stack(columns).reshape(4, -1))
+    power, others, count, part = np.concatenate(every, axis=1)
     alone = (1 + power / np.maximum(others, np.finfo(float).tiny)) ** -count
     p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
-    share = np.sqrt(power[alone.argmin()] / power.sum()) * left_share(fit)
+    share = np.sqrt(part[alone.argmin()]) * left_share(fit)
     return Test("lone frequency", p, float(share))
 
 

@@ -13,6 +13,7 @@ from jaxsid.gap.null import left_share
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
+LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 LAPSE = 0.04  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
 
@@ -55,7 +56,8 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
 
 def _slight(found: Examination) -> bool:
     """Whether what tests find is small beside the noise, so that no law could be told from it."""
-    return bool(found.null.share < SLIGHT * left_share(found.fit))
+    noisy = found.fit.squares < LOUD**2 * found.fit.equations
+    return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
 def _unexplained(causes: Causes) -> float:

@@ -3,9 +3,9 @@
 import numpy as np
 
 from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.examine import NEGLIGIBLE, SIGNIFICANT
+from jaxsid.gap.examine import NEGLIGIBLE
 from jaxsid.gap.locate import Location
-from jaxsid.gap.null import Test
+from jaxsid.gap.null import SIGNIFICANT, Test
 from jaxsid.report.causes_page import (
     before_after_section,
     closure_cards,
