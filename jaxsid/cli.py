@@ -389,7 +389,7 @@ def _method(choice: Method, records, say):
 
 
 def _load_meanwhile(*modules: str) -> None:
-    """Load what is needed later while the main thread waits for results: a second of a warm run."""
+    """Load what is needed later while the main thread waits for results: a twentieth of a warm run."""
 
     def load() -> None:
         for name in modules:

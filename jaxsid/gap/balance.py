@@ -20,7 +20,6 @@ from jaxsid.gap.spectra import Spectra, in_time, parameter_columns
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.lumped import free_bodies
-from jaxsid.records import ContinuousModel
 
 
 class Balance(NamedTuple):
@@ -128,7 +127,7 @@ def _balanced(
             lambda s: (s.mass, s.damping, s.stiffness, s.input_matrix), linear, (*moved, pushed)
         )
         plain = physical_displacement_velocity(model)
-        sampled = discretise(ContinuousModel(plain.A, plain.B, plain.C, plain.D), spectra.dt)
+        sampled = discretise(plain, spectra.dt)
         inputs, forces = jnp.split(sampled.B, [len(u)], axis=1)
         k = patterns.shape[1]
         gauge = jnp.concatenate([patterns.T, jnp.zeros_like(patterns.T)], axis=1)
@@ -173,7 +172,7 @@ def _share(
                 (v, model.velocity_sensors),
                 (a, model.acceleration_sensors),
             ):
-                y += np.outer(x, np.asarray(sensors) @ phi)
+                y += np.outer(x, np.asarray(spectra.present) * (np.asarray(sensors) @ phi))
         done = done + ((y - y.mean(axis=0)) ** 2).sum(axis=0)
         measured = np.asarray(in_time(spectra, spectra.y))
         whole = whole + ((measured - measured.mean(axis=0)) ** 2).sum(axis=0)

@@ -26,6 +26,7 @@ from jaxsid.impulse.lines import line_level
 
 SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
+LEAST = 1e-12  # of a line's power, that those around it have: rounding
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
 
@@ -160,26 +161,34 @@ def _lone_line(fit: Recalibrated) -> Test:
     """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees.
 
     Lines are those of Hann's window, so that a frequency between two of them has no skirts; of those around it the
-    nearest are left out, and of the others every second, which share nothing.
+    nearest are left out, and of the others every second, which share nothing. It must stand out from either side.
     """
-    apart = np.abs(np.arange(-AROUND, AROUND + 1))
-    around, every = ((apart >= GUARD) & (apart % 2 == GUARD % 2)).astype(float), []
+    apart = np.arange(-AROUND, AROUND + 1)
+    below = ((apart >= GUARD) & (apart % 2 == GUARD % 2)).astype(float)
+    every = []
     for setting, linear in zip(fit.settings, fit.linear, strict=True):
         used = np.asarray(setting.spectra.weight) == 1
         left = np.asarray(linear.left)[used][:, np.asarray(setting.spectra.present) > 0]
         lines = left * np.asarray(setting.scale)[used][:, np.asarray(setting.spectra.present) > 0]
-        power = np.abs(lines - (np.roll(lines, 1, axis=0) + np.roll(lines, -1, axis=0)) / 2) ** 2
-        sums = lambda x, which: np.stack([np.convolve(c, which, mode="same") for c in x.T], axis=1)  # noqa: E731
+        power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
         # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
         whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
-        part = sums(np.abs(left) ** 2, np.ones(2 * GUARD - 1)) / whole
-        columns = power, sums(power, around), sums(np.ones_like(power), around), part
-        every.append(np.stack(columns).reshape(4, -1))
-    power, others, count, part = np.concatenate(every, axis=1)
-    alone = (1 + power / np.maximum(others, np.finfo(float).tiny)) ** -count
+        part = _sums(np.abs(left[1:-1]) ** 2, np.ones(2 * GUARD - 1)) / whole
+        sides = [_sums(x, side) for side in (below, below[::-1]) for x in (power, np.ones_like(power))]
+        every.append(np.stack([power, part, *sides]).reshape(6, -1))
+    power, part, *sides = np.concatenate(every, axis=1)
+    # on either side: the edge of what is strong at low frequencies is no lone one
+    pairs = ((np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in (sides[:2], sides[2:]))
+    alone = np.maximum(*((1 + power / np.maximum(x, np.finfo(float).tiny)) ** -n for x, n in pairs))
     p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
     share = np.sqrt(part[alone.argmin()]) * left_share(fit)
     return Test("lone frequency", p, float(share))
+
+
+def _sums(x: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Of every column, about each row, as far as there are rows."""
+    half = len(around) // 2
+    return np.stack([np.convolve(c, around)[half : half + len(c)] for c in x.T], axis=1)
 
 
 def _power(fit: Recalibrated) -> Test:

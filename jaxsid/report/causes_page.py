@@ -47,7 +47,7 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
     remark = said[name]
     chance_of = verdict.probability[name]
     if found.causes is not None and found.causes.selected and name == "effect":
-        chance_of = float(np.prod([found.probability(x) for x in found.causes.selected]))
+        chance_of *= float(np.prod([x.probability for x in found.causes.selected]))
         remark = "of this explanation, of all that were tried"
     return (
         Card("Gap before", misfit(closure.before), "nominal model, held-out samples (NRMSE)"),
