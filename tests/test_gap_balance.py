@@ -19,7 +19,7 @@ SPEEDS = (("b1", "velocity"), ("b2", "velocity"))
 MIXED = (("b1", "displacement"), ("b2", "acceleration"))
 
 
-def axis(sensors=SPEEDS, drag=0.0):
+def axis(sensors=SPEEDS, drag=0.0, hold="zero"):
     """Two bodies that a spring joins, and that nothing but a damper holds."""
     more = [Connection("drag", ("ground", "b1"))] if drag else []
     return lumped_model(
@@ -28,7 +28,7 @@ def axis(sensors=SPEEDS, drag=0.0):
         [300.0, 0.0][: 1 + len(more)],
         [0.5, drag][: 1 + len(more)],
         connections=[Connection("joint", ("b1", "b2")), *more],
-        inputs=[Input("drive", "b1")],
+        inputs=[Input("drive", "b1", hold)],
         sensors=[Sensor(f"{body} {kind}", body, kind) for body, kind in sensors],
     )
 
@@ -40,16 +40,21 @@ def readings(model, force, seed=0, start=(0.1, -0.2, 0.3, 0.1)):
     solve = lambda x: -np.linalg.solve(M, x)  # noqa: E731
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [solve(K), solve(D)]])
     B = np.concatenate([np.zeros((2, 2)), np.diag(1 / np.diag(M))])
-    step = expm(np.block([[A, B], [np.zeros((2, 6))]]) * DT)
+    # what pushes ramps from one sample to the next where the hold is of first order
+    ramp = np.block([[A, B, np.zeros((4, 2))], [np.zeros((2, 6)), np.eye(2) / DT], [np.zeros((2, 8))]])
+    step = expm(ramp * DT)
     pushes = np.column_stack([np.random.default_rng(seed).standard_normal(SAMPLES), np.full(SAMPLES, force)])
     sensed = [
         np.asarray(x)
         for x in (plain.displacement_sensors, plain.velocity_sensors, plain.acceleration_sensors)
     ]
+    follow = np.append(pushes[1:], pushes[-1:], axis=0) - pushes
+    if model.inputs[0].hold == "zero":
+        follow = 0 * follow
     x, y = np.array(start), []
-    for push in pushes:
+    for push, change in zip(pushes, follow, strict=True):
         y.append(sensed[0] @ x[:2] + sensed[1] @ x[2:] + sensed[2] @ (A @ x + B @ push)[2:])
-        x = step[:4, :4] @ x + step[:4, 4:] @ push
+        x = step[:4] @ np.concatenate([x, push, change])
     return pushes[:, :1], np.array(y)
 
 
@@ -65,7 +70,9 @@ def fitted(model, force, seed=0):
 
 
 @pytest.mark.parametrize(
-    "model", [axis(), axis(drag=0.3), axis(MIXED), axis(MIXED, 0.3)], ids=["free", "dragged", "mixed", "both"]
+    "model",
+    [axis(), axis(drag=0.3), axis(MIXED), axis(MIXED, 0.3), axis(MIXED, hold="first")],
+    ids=["free", "dragged", "mixed", "both", "ramps"],
 )
 def test_noise_alone_gives_what_chance_does(model):
     fits = [fitted(model, 0.0, seed) for seed in range(16)]
@@ -75,7 +82,11 @@ def test_noise_alone_gives_what_chance_does(model):
     assert max(statistics) < 12
 
 
-@pytest.mark.parametrize("model", [axis(), axis(drag=0.3), axis(MIXED)], ids=["free", "dragged", "mixed"])
+@pytest.mark.parametrize(
+    "model",
+    [axis(), axis(drag=0.3), axis(MIXED), axis(MIXED, hold="first")],
+    ids=["free", "dragged", "mixed", "ramps"],
+)
 def test_a_steady_force_is_found_and_measured(model):
     fit = fitted(model, 0.02)
     (found,) = _steady(fit, fit.settings)

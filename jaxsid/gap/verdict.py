@@ -14,7 +14,7 @@ LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
-LAPSE = 0.04  # share of development cases in which what explains all and is far ahead of all else is not the truth
+LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
 
 class Verdict(NamedTuple):
