@@ -8,7 +8,7 @@ import pytest
 from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
-from jaxsid.gap.causes import OFF, WORTH, Causes, _beyond, _Found, _off, _worth
+from jaxsid.gap.causes import OFF, SLIGHT, WORTH, Causes, _beyond, _Found, _off, _worth
 from jaxsid.gap.closure import Closure, Left, fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
@@ -25,9 +25,11 @@ from jaxsid.gap.explain import (
 )
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
+from jaxsid.gap.null import Null
+from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
-from jaxsid.gap.verdict import LAPSE, verdict_of
+from jaxsid.gap.verdict import LAPSE, LOUD, verdict_of
 from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_model, second_order
 from jaxsid.physical.elements import element_matrices
 
@@ -244,6 +246,19 @@ def test_none():
     assert sum(found.probability.values()) == pytest.approx(1)
     doubtful = verdict_of(examination(0.006, 0.6), None)
     assert 0.5 < doubtful.probability["none"] < 0.6
+
+
+def test_what_is_far_above_the_noise_is_never_none(monkeypatch):
+    # causes that chose nothing, and tests whose share is small beside what is left
+    monkeypatch.setattr("jaxsid.gap.verdict.left_share", lambda fit: 0.1)
+    fit = Recalibrated(None, *(np.zeros(1),) * 3, (), (), (), 0.0, 1000)
+    tried = causes(ranking(0.0, -1.0), closures=[closure(0.29)])._replace(selected=())
+    verdict = {}
+    for rms in (0.99 * LOUD, 1.01 * LOUD):
+        left = fit._replace(squares=rms**2 * fit.equations)
+        found = examination()._replace(finding="structure", fit=left, null=Null(1e-9, 0.1 * 0.9 * SLIGHT, ()))
+        verdict[rms > LOUD] = verdict_of(found, tried).name
+    assert verdict == {False: "none", True: "unknown"}
 
 
 def test_effect():
