@@ -70,6 +70,17 @@ def test_probabilities_are_those_of_the_candidates(written):
     assert [x["probability"] for x in others] == sorted((x["probability"] for x in others), reverse=True)
 
 
+def test_remarks_on_places_are_for_what_no_law_explains(cubic):
+    located = cubic.examination.locations._replace(remarks=("of the place",))
+    found = cubic.examination._replace(locations=located)
+
+    def shown(verdict):
+        judgement = cubic.judgement._replace(name=verdict)
+        return "of the place" in module._warnings(cubic.nominal, cubic.records, found, judgement, False)
+
+    assert [shown(x) for x in ("effect", "none", "unknown", "ambiguous")] == [False, False, True, True]
+
+
 def test_the_gap_closes_on_held_out_samples(written):
     closure = written["closure"]
     assert closure["heldout_before"] > closure["heldout_recalibrated"] > 0.1

@@ -268,7 +268,7 @@ def diagnose(
         causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
     )
     verdict = verdict_of(found, causes)
-    said = _warnings(model, seen, found, initial == "rest")
+    said = _warnings(model, seen, found, verdict, initial == "rest")
     return Diagnosis(
         model, records, found, causes, verdict, _experiment(model, seen, causes, verdict, progress), said
     )
@@ -292,7 +292,7 @@ def _experiment(
 
 
 def _warnings(
-    model: LumpedModel, records: tuple[Record, ...], found: Examination, rest: bool
+    model: LumpedModel, records: tuple[Record, ...], found: Examination, verdict: Verdict, rest: bool
 ) -> tuple[str, ...]:
     said = []
     if model.effects:
@@ -316,7 +316,8 @@ def _warnings(
             "model leaves. Noise units are as good as that."
         )
     said += _about_starts(records, found) if rest else []
-    if found.locations is not None:
+    # what a law explains has its place by the law, not by the force alone
+    if found.locations is not None and verdict.name in ("unknown", "ambiguous"):
         said += found.locations.remarks
     return tuple(said)
 
