@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxsid.compilation
+from jaxsid import InputError, diagnose, identify
 from jaxsid.compilation import compiled, keep_programs, release_programs
 from jaxsid.examples.systems import three_dof
 from jaxsid.mechanics.first_order import physical_displacement_velocity
@@ -162,6 +163,15 @@ def test_released_programs_come_back_from_disk(folder: Path, matrix: np.ndarray)
     count = traces.count
     np.testing.assert_array_equal(run(matrix, jnp.asarray(1.0))[0].values, first)
     assert traces.count == count
+
+
+@pytest.mark.parametrize("begun", [identify, diagnose])
+def test_long_work_releases_the_programs_of_other_sizes(begun, monkeypatch):
+    released = []
+    monkeypatch.setitem(begun.__globals__, "release_programs", lambda: released.append(True))
+    with pytest.raises(InputError):
+        begun(three_dof(), [])
+    assert released == [True]
 
 
 def test_threads_that_begin_together_share_a_program(folder: Path, matrix: np.ndarray):

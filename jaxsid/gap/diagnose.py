@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsid.checks import require
+from jaxsid.compilation import release_programs
 from jaxsid.gap.causes import Causes, causes_of
 from jaxsid.gap.closure import Closure, seen_part
 from jaxsid.gap.examine import Examination, examine
@@ -262,6 +263,7 @@ def diagnose(
     """
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
     records = (records,) if isinstance(records, Record) else tuple(records)
+    release_programs()  # those of systems of other sizes, should there be very many
     seen = tuple(seen_part(r) for r in records)
     found = examine(model, seen, progress=progress)
     causes = (

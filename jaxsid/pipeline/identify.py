@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsid.checks import InsufficientDataError, check_excitation, require
+from jaxsid.compilation import release_programs
 from jaxsid.identification import Identification, MatrixDeviation
 from jaxsid.impulse.lines import Lines, record_lines
 from jaxsid.impulse.protocol import ImpulseMethod
@@ -72,6 +73,7 @@ def identify(
     """
     say = progress or (lambda text: None)
     records = (records,) if isinstance(records, Record) else tuple(records)
+    release_programs()  # those of systems of other sizes, should there be very many
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose estimate or rest.")
     require(structure in STRUCTURES, f"structure '{structure}' is unknown; choose {' or '.join(STRUCTURES)}.")
     require(
