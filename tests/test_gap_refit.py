@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from jaxsid import Record
-from jaxsid.gap.hypothesis import coordinates_of, parameter_rows
+from jaxsid.gap.hypothesis import coordinates_of, parameter_rows, shifts_of
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of
 from jaxsid.gap.setting import slowest_rate
@@ -138,6 +138,9 @@ def test_every_record_has_a_phase_of_its_own():
     rows = np.array([parameters_of(shot, jnp.asarray(theta), k) for k in range(3)])
     np.testing.assert_allclose(rows[:, 0, :3], [[1, 3, 0.2], [1, 3, 0.7], [1, 3, -0.8]], rtol=1e-9)
     np.testing.assert_allclose(rows[:, 1, 0], 0.02)
+    # a fit that goes on begins with them
+    fitted = effect("periodic_disturbance", "b2", amplitude=1.0, frequency_hz=3.0, phase=rows[:, 0, 2])
+    np.testing.assert_allclose(shifts_of((fitted, delay), 3), [0.5, 0.0, -1.0, 0.0], rtol=1e-9)
     deviation = _prior(of, Hypothesis((sine, delay)), shot).deviation[-4:]
     np.testing.assert_allclose(deviation, [np.pi, 1e-9, np.pi, 1e-9])
 

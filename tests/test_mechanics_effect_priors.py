@@ -1,5 +1,8 @@
 """Scales and priors of every kind's parameters: they are there, they follow the units, they are distributions."""
 
+import dataclasses
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +14,8 @@ from jaxsid.mechanics.amplitudes import amplitudes
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, scales
 from jaxsid.mechanics.effects.kind import Motion, Nominal
 from jaxsid.mechanics.effects.prior import Amplitudes, Prior, Scale
-from jaxsid.mechanics.lumped import Effect, second_order
-from jaxsid.mechanics.slots import slots_of
+from jaxsid.mechanics.lumped import Connection, Effect, Input, second_order
+from jaxsid.mechanics.slots import nominal_at, slots_of
 
 LENGTH, FORCE, TIME, READING = 1e3, 2.0, 7.0, 5.0  # of new units in the old ones, inverse
 AT = Amplitudes(*(jnp.asarray(x) for x in (3.0, 0.02, 0.4, 1.7, 18.0, 10.0)))
@@ -121,3 +124,25 @@ def test_amplitudes_of_places():
     np.testing.assert_allclose(found.signal[3:], [rms(y[:, 0]), rms(u[:, 0])])
     slowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min())
     np.testing.assert_allclose(found.rate, slowest)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_rounding_leaves_joins_nothing(seed):
+    """Springs of a body add up to none but for rounding where none of them goes to the ground."""
+    rng = np.random.default_rng(seed)
+    bodies = [f"b{i}" for i in range(6)]
+    stiffness, damping = rng.uniform(0.1, 9e3, 6), rng.uniform(0.01, 9.0, 6)
+    chain = [Connection(f"c{i}", ends) for i, ends in enumerate(pairwise(["ground", *bodies]))]
+    push = [Input("push", "b0")]
+    model = jaxsid.lumped_model(bodies, np.ones(6), stiffness, damping, connections=chain, inputs=push)
+    ends = [("ground", b) for b in bodies]
+    effects = [Effect("coulomb_friction", (("between", x),), {"force": 1.0}) for x in ends]
+    slots = slots_of(dataclasses.replace(model, effects=tuple(effects)))
+    found = nominal_at(slots, second_order(model))
+    assert float(found.stiffness[0]) == pytest.approx(stiffness[0], rel=1e-9)
+    assert float(found.damping[0]) == pytest.approx(damping[0], rel=1e-9)
+    assert not np.asarray(found.stiffness[1:]).any()
+    assert not np.asarray(found.damping[1:]).any()
+    rough = np.random.default_rng(0).standard_normal((2, 100, 6))
+    force = amplitudes(second_order(model), slots, *rough, np.ones((100, 1)), rough[0][:, :0], 0.01).force
+    assert (np.asarray(force) > 1e-2).all()

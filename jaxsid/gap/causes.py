@@ -131,7 +131,7 @@ def causes_of(
         change = np.where(nominal != 0, values / np.where(nominal != 0, nominal, 1.0) - 1, 0.0)
         within = refitted(start.bench, Hypothesis(), changes=change)
         at = start._replace(before=within, look=start.look._replace(scored=None))
-    at = _numbers(at, model, seen, say, gains=found.finding == "parameters")
+    at = _numbers(at, model, seen, say)
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before
@@ -201,9 +201,15 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     while before < len(at.selected) < most and candidates:
         before = len(at.selected)
         at = _further(at, candidates, FURTHER if before > begun else FIRST, model, seen, say)
+        if steady and before == begun == 0 < len(at.selected):
+            # beside what was far larger it was not worth it
+            at = _further(at, steady, FURTHER, model, seen, say)
+            most += len(at.selected) - 1
+        if len(at.selected) == most:
+            at = _needed(at, model, seen, say)
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
-        candidates = tuple(c for pair in zip(now, _varied(first[1:]), strict=False) for c in pair)
+        candidates = tuple(c for pair in zip(now, _varied(first), strict=False) for c in pair)
     return _needed(at, model, seen, say)
 
 
@@ -237,16 +243,14 @@ def _further(
 
 def _needed(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
     """Without the effects that those found later have made needless."""
+    errors = elements_by_key(model)
     for x in at.selected[:-1]:
         before, last = at.before, at.rounds[-1]
         assert before is not None
         effects = tuple(e for e in before.hypothesis.effects if key_of(e.kind, dict(e.place)) != x.key)
-        if len(effects) == len(before.hypothesis.effects):
-            continue
+        wrong = tuple(i for i in before.hypothesis.wrong if i not in errors.get(x.key, ()))
         say(f"whether {x.kind} is needed")
-        without = refitted(
-            at.bench, before.hypothesis._replace(effects=effects), changes=changes_of(before, at.bench)
-        )
+        without = refitted(at.bench, Hypothesis(effects, wrong), changes=changes_of(before, at.bench))
         if (before.fit.evidence - without.fit.evidence) / last.scale / last.temperature > WORTH:
             continue
         kept = [i for i, y in enumerate(at.selected) if y.key != x.key]
@@ -257,17 +261,11 @@ def _needed(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callabl
     return at
 
 
-def _numbers(
-    at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None], *, gains: bool
-) -> _Found:
-    """Numbers of the model that are off by more than they may be, one after another.
-
-    Args:
-        gains: whether those of signals, which numbers can stand for, are to be tried too.
-    """
+def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
+    """Numbers of the model that are off by more than they may be, one after another, and gains that look like them."""
     begun = len(at.selected)
     while len(at.selected) < MOST_EFFECTS and at.before is not None:
-        candidates = _off(at, gains)
+        candidates = _off(at)
         if not candidates:
             return at
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
@@ -281,7 +279,7 @@ def _numbers(
     return at
 
 
-def _off(at: _Found, gains: bool) -> tuple[Candidate, ...]:
+def _off(at: _Found) -> tuple[Candidate, ...]:
     """The model's numbers that its fit holds for off, farthest first, and gains."""
     assert at.before is not None
     bench, wrong = at.bench, at.before.hypothesis.wrong
@@ -292,9 +290,8 @@ def _off(at: _Found, gains: bool) -> tuple[Candidate, ...]:
     rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
     off = [x for x in rows if far[list(x)].max() > OFF and not {*x} <= {*wrong}]
     found = [new(ERRORS[listed[i].quantity], element_place(model, listed[i]), {}) for i, *_ in off]
-    if gains:
-        found[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
-        found += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]
+    found[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
+    found += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]
     return tuple(found) if off else ()
 
 

@@ -198,6 +198,21 @@ def parameter_rows(effects: Sequence[Effect]) -> Float[np.ndarray, "slots most"]
     return found
 
 
+def shifts_of(effects: Sequence[Effect], records: int) -> Float[np.ndarray, " n"]:
+    """What is added in further records to a parameter that each has of its own: (records - 1) * slots.
+
+    Args:
+        effects: of the hypothesis, such a parameter an array over the records.
+        records: how many.
+    """
+    found = np.zeros((records - 1, max(len(effects), 1)))
+    for row, effect in enumerate(effects):
+        for value in effect.parameters.values():
+            if np.size(value) == records > 1:
+                found[:, row] = np.asarray(value)[1:] - np.asarray(value)[0]
+    return found.ravel()
+
+
 def with_parameters(effect: Effect, values: Mapping[str, Array | float | np.ndarray]) -> Effect:
     """The same effect with other parameters.
 

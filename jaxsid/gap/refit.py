@@ -17,6 +17,7 @@ from jaxsid.gap.hypothesis import (
     coordinates_of,
     effect_slots,
     parameter_rows,
+    shifts_of,
     with_parameters,
 )
 from jaxsid.gap.noise import Noise, residual_noise
@@ -239,7 +240,8 @@ def tied(bench: Bench, found: Refit, *, steps: int, gain: float = GAIN) -> tuple
     shown = np.concatenate(
         [(np.asarray(b.y) * np.asarray(b.weight)).reshape(-1, b.y.shape[2]) for b in bench.blocks]
     )
-    shown = np.where(shown != 0, shown, np.nan)
+    seen = (shown != 0).any(axis=0)
+    shown = np.where(shown != 0, shown, np.nan)[:, seen]
     level = 1 / np.exp(np.log(np.nanstd(shown, axis=0)).mean())
     chained = bench._replace(jump=JUMP * level)
     begin = {"changes": changes_of(found, bench), "states": found.fit.states}
@@ -288,7 +290,7 @@ def refitted(
     z = shot.coordinates.unknowns(parameter_rows(effects))
     prior = _prior(bench, hypothesis, shot)
     start = np.zeros(len(bench.tolerance)) if changes is None else np.asarray(changes)
-    theta = np.concatenate([start, z.ravel(), np.zeros((bench.records - 1) * len(z))])
+    theta = np.concatenate([start, z.ravel(), shifts_of(effects, bench.records)])
     own = 2 * slots.count
     given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
     # all but laws is integrated exactly

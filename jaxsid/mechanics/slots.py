@@ -10,6 +10,8 @@ from jaxsid.mechanics.effects.kind import Nominal
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.records import SecondOrderModel, as_array
 
+ROUNDING = 1e-9  # of what joins a body: a sum below which it is none
+
 
 class Slots(eqx.Module):
     """Effects, each with its kind, parameters and place; all rows may be traced.
@@ -90,7 +92,9 @@ def nominal_at(slots: Slots, linear: SecondOrderModel) -> Nominal:
 
     def across(matrix: Array) -> Array:
         rows = jnp.abs(joints) @ matrix
-        return jnp.where(grounded, rows.sum(axis=1), -jnp.einsum("si,ij,sj->s", first, matrix, second))
+        found = jnp.where(grounded, rows.sum(axis=1), -jnp.einsum("si,ij,sj->s", first, matrix, second))
+        # the springs of a body that is not joined to the ground do not quite add up to none
+        return jnp.where(jnp.abs(found) > ROUNDING * jnp.abs(rows).sum(axis=1), found, 0.0)
 
     mass = jnp.einsum("si,ij,sj->s", joints, linear.mass, joints)
     return Nominal(mass, across(linear.damping), across(linear.stiffness))
