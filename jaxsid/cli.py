@@ -216,7 +216,7 @@ def effects(
         ),
     ] = None,
 ) -> None:
-    """The kinds of effects beyond the linear model: friction, backlash, delays and others, for [[effects]]."""
+    """Kinds of effects beyond the linear model that a model file may hold: friction, backlash, delays and others."""
     with _errors():
         if out is not None:
             _numerics()
@@ -246,7 +246,7 @@ def demo(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """The whole story on the built-in rig: identify it, then find what is the matter with it later."""
+    """Identify the built-in rig; with --later also find out what is the matter with it later."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
@@ -454,7 +454,9 @@ def _diagnosis_summary(found, out: Path) -> None:
     from jaxsid.report.diagnosis_summary import print_diagnosis
 
     print_diagnosis(found)
-    typer.echo(f"\nWritten to {out}: diagnosis.json, model.toml, forces.npz, report.html")
+    names = ["diagnosis.json", "model.toml", "forces.npz", "report.html"]
+    names += ["next_input.csv"] if found.experiment is not None else []
+    typer.echo(f"\nWritten to {out}: {', '.join(names)}")
 
 
 @contextmanager
