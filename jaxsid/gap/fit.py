@@ -280,7 +280,8 @@ def _covariance(at: _At, normal: _Normal, reduced: np.ndarray, back: np.ndarray)
     each = at.gram[:, :p, -1] - np.einsum("wnp,wn->wp", back[:, :, :p], at.gram[:, p:-1, -1])
     moves = (each - each.mean(axis=0)) @ found
     told = (moves**2).sum(axis=0) * len(moves) / (len(moves) - 1)
-    larger = np.sqrt(np.maximum(told / np.maximum(np.diag(found), np.finfo(float).tiny), 1.0))
+    own = np.diag(found)
+    larger = np.sqrt(np.maximum(np.divide(told, own, out=np.ones_like(own), where=own > 0), 1.0))
     return found * larger * larger[:, None]
 
 
