@@ -1,5 +1,6 @@
 """Programs kept on disk: the same numbers, found again, and never trusted when damaged or when they do not fit."""
 
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -168,7 +169,8 @@ def test_released_programs_come_back_from_disk(folder: Path, matrix: np.ndarray)
 @pytest.mark.parametrize("begun", [identify, diagnose])
 def test_long_work_releases_the_programs_of_other_sizes(begun, monkeypatch):
     released = []
-    monkeypatch.setitem(begun.__globals__, "release_programs", lambda: released.append(True))
+    module = sys.modules[begun.__module__]
+    monkeypatch.setattr(module, "release_programs", lambda: released.append(True))
     with pytest.raises(InputError):
         begun(three_dof(), [])
     assert released == [True]
