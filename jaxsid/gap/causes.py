@@ -205,8 +205,6 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
             # beside what was far larger it was not worth it
             at = _further(at, steady, FURTHER, model, seen, say)
             most += len(at.selected) - 1
-        if len(at.selected) == most:
-            at = _needed(at, model, seen, say)
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
         candidates = tuple(c for pair in zip(now, _varied(first), strict=False) for c in pair)
