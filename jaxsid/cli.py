@@ -241,20 +241,20 @@ def demo(
         "demo"
     ),
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
-    later: Annotated[
-        bool, typer.Option(help="Diagnose a later record too, of the rig with friction; this takes minutes.")
+    brief: Annotated[
+        bool, typer.Option("--brief", help="Leave out the diagnosis, which takes a minute or two.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Identify the built-in rig; with --later also find out what is the matter with it later."""
+    """The whole story on the built-in rig: identify it, and find out what is the matter with it later."""
     with _errors(), _progress(quiet) as say:
         say("loading")
         _numerics()
         from jaxsid.demo import LATER, run_demo, run_later
 
         found, changed = run_demo(out, seed, say), None
-        _write(found, out, say, later=f"{LATER}/report.html" if later else None)
-        if later:
+        _write(found, out, say, later=None if brief else f"{LATER}/report.html")
+        if not brief:
             changed = run_later(found, out / LATER, seed, say)
             _write_diagnosis(changed, out / LATER, say)
     if not quiet:

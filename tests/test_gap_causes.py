@@ -1,6 +1,7 @@
 """What is concluded from fits, without fitting: rankings, sets, verdicts, numbers of a model as effects, offsets."""
 
 import math
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
-from jaxsid.gap.causes import OFF, SLIGHT, WORTH, Causes, _beyond, _Found, _off, _worth
+from jaxsid.gap import causes as module
+from jaxsid.gap.causes import OFF, SLIGHT, WORTH, Causes, _beyond, _Found, _off, _reconsidered, _worth
 from jaxsid.gap.closure import Closure, Left, fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
@@ -27,11 +29,12 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
 from jaxsid.gap.null import Null
+from jaxsid.gap.places import Place
 from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
-from jaxsid.gap.verdict import LAPSE, LOUD, verdict_of
-from jaxsid.mechanics.lumped import Connection, Input, Matrices, Sensor, lumped_model, second_order
+from jaxsid.gap.verdict import LAPSE, LOUD, Verdict, concluded, verdict_of
+from jaxsid.mechanics.lumped import Connection, Effect, Input, Matrices, Sensor, lumped_model, second_order
 from jaxsid.physical.elements import element_matrices
 
 B12, B23 = {"between": ("b1", "b2")}, {"between": ("b2", "b3")}
@@ -219,6 +222,79 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
     assert _off(at._replace(before=still)) == ()
 
 
+# effects asked again
+
+
+def explained(kind, place, evidence, effects):
+    of = Hypothesis(tuple(Effect(k, tuple(p.items()), {}) for k, p in effects))
+    return Explanation(kind, place, refit(evidence, hypothesis=of), evidence, 0.9)
+
+
+@pytest.fixture
+def two(monkeypatch):
+    """A cubic spring and, found later, hysteresis elsewhere; evidence by what a hypothesis holds."""
+    cubic, later = ("cubic_stiffness", B12), ("hysteresis", B23)
+    selected = explained(*cubic, -500.0, [cubic]), explained(*later, 0.0, [cubic, later])
+    rounds = ranking(-500.0, -600.0), ranking(0.0, kinds=[later])
+    at = _Found(BENCH, "looked", rounds, selected, selected[-1].refit)
+    monkeypatch.setattr(module, "states_without", lambda found, row: ())
+    monkeypatch.setattr(module, "changes_of", lambda found, bench: None)
+    monkeypatch.setattr(module, "_looked", lambda *_: "looked again")
+    monkeypatch.setattr(module, "tied", lambda bench, found, **_: (bench, found))
+    monkeypatch.setattr(module, "weighed_anew", lambda bench, found, **_: bench)
+
+    def set_up(evidences):
+        """(cubic, backlash, neither) beside hysteresis."""
+        value = dict(zip(("cubic_stiffness", "backlash", None), evidences, strict=True))
+        asked = []
+
+        def fitted(bench, hypothesis, **_):
+            kinds = [e.kind for e in hypothesis.effects]
+            first = next((k for k in kinds if k != "hysteresis"), None)
+            return refit(value[first] if "hysteresis" in kinds else -500.0, hypothesis=hypothesis)
+
+        def rank(bench, candidates, without, effort, say):
+            asked.append([c.kind for c in candidates])
+            every = [(c, fitted(bench, extended(without.hypothesis, c, {}))) for c in candidates]
+            return _ranked([(c, r, r.fit.evidence) for c, r in every], without, BENCH, TEMPERATURE)
+
+        monkeypatch.setattr(module, "refitted", fitted)
+        monkeypatch.setattr(module, "rank", rank)
+        found = _reconsidered(at, chain(), (), lambda text: None)
+        assert asked[0] == ["cubic_stiffness", "backlash"]
+        return found, asked
+
+    return set_up
+
+
+def test_an_effect_that_holds_beside_a_later_one_stays(two):
+    found, asked = two((0.0, -20.0, -300.0))
+    assert [x.kind for x in found.selected] == ["cubic_stiffness", "hysteresis"]
+    assert len(asked) == 1
+    assert found.look == "looked"
+    # its probability is that beside the later one
+    assert found.selected[0].probability == pytest.approx(1 / (1 + math.exp(-20 / TEMPERATURE)), abs=1e-6)
+    assert found.rounds[0].ranked[0].probability == found.selected[0].probability
+
+
+def test_another_effect_takes_its_place(two):
+    found, asked = two((-100.0, 0.0, -300.0))
+    assert [x.kind for x in found.selected] == ["backlash", "hysteresis"]
+    assert [len(x.refit.hypothesis.effects) for x in found.selected] == [1, 2]
+    assert found.before is found.selected[-1].refit
+    assert found.look == "looked again"
+    # then the later one is asked again beside it
+    assert asked[1:] == [["hysteresis"]]
+
+
+def test_an_effect_that_a_later_one_makes_needless_is_left_out(two):
+    found, _ = two((0.0, 0.0, -WORTH * TEMPERATURE * 0.9))
+    assert [x.kind for x in found.selected] == ["hysteresis"]
+    assert len(found.rounds) == 1
+    assert found.before is found.selected[-1].refit
+    assert [e.kind for e in found.before.hypothesis.effects] == ["hysteresis"]
+
+
 # verdicts
 
 
@@ -236,8 +312,12 @@ def causes(*rounds, closures):
     chosen = [r.ranked[0] for r in rounds][: len(closures)]
     last = chosen[-1].refit
     nothing = Left((), ())
+    linear = closure(0.3)
+    lefts = tuple(nothing for _ in closures)
+    ends = nothing, Left((np.ones((1, 1)),), ())
+    best = refit(0.0)
     return Causes(
-        rounds, last, tuple(chosen), last, last, tuple(closures), nothing, (), None, None, (nothing, nothing)
+        rounds, last, tuple(chosen), last, best, tuple(closures), lefts, linear, (), None, None, ends
     )
 
 
@@ -301,6 +381,37 @@ def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
     linear = closure(0.0101, recalibrated=0.0102)
     assert linear.against_recalibrated < 0.5
     assert verdict_of(examination(), causes(ranking(0.0), closures=[linear])).name == "effect"
+
+
+@pytest.mark.parametrize(
+    ("left_at", "gaps", "kept"),
+    [
+        (Place("between", ("b2", "b3")), (0.1, 0.09), 1),  # the second stands in for what is there
+        (Place("between", ("b3", "b1")), (0.1, 0.09), 1),  # and the second explains little of what was left
+        (Place("between", ("b3", "b1")), (0.14, 0.06), 2),
+        (Place("between", ("b2", "b1")), (0.1, 0.09), 0),
+        (Place("sensor", ("s1",)), (0.2, 0.09), 0),
+        (None, (0.1, 0.09), 0),
+    ],
+)
+def test_a_stand_in_for_an_unknown_law_is_not_selected(monkeypatch, left_at, gaps, kept):
+    monkeypatch.setattr("jaxsid.gap.verdict.verdict_of", lambda *_: Verdict("unknown", {}, ((), ())))
+    monkeypatch.setattr("jaxsid.gap.verdict.located", lambda x: SimpleNamespace(likely=(x,)))
+    here, there = ranking(0.0, kinds=[("backlash", B12)]), ranking(0.0, kinds=[("hysteresis", B23)])
+    found = causes(here, there, closures=[closure(x) for x in gaps])._replace(places=left_at)
+    left, verdict = concluded(examination(), found)
+    assert [x.kind for x in left.selected] == ["backlash", "hysteresis"][:kept]
+    assert len(verdict.likely) == kept
+    # model, closure and what is left are of one hypothesis
+    assert len(left.closures) == len(left.lefts) == max(kept, 1)
+    assert left.chosen is (found.selected[kept - 1].refit if kept else found.recalibrated)
+    assert left.closures[-1] is (found.closures[kept - 1] if kept else found.linear)
+    assert left.lefts[-1] is (found.lefts[kept - 1] if kept else found.before[1])
+
+
+def test_a_verdict_other_than_unknown_leaves_all_causes():
+    found = causes(ranking(0.0, -200.0), closures=[closure(0.012)])
+    assert concluded(examination(), found)[0] is found
 
 
 # offsets and records without noise

@@ -8,7 +8,16 @@ from gap_helpers import DT, SAMPLES, chain, drive, exact, record
 
 import jaxsid
 from jaxsid.gap import closure as module
-from jaxsid.gap.closure import HELD_OUT, Left, closure_of, fraction, held_out_begin, left_of, seen_part
+from jaxsid.gap.closure import (
+    HELD_OUT,
+    Left,
+    _run_on,
+    closure_of,
+    fraction,
+    held_out_begin,
+    left_of,
+    seen_part,
+)
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
 from jaxsid.gap.refit import Hypothesis, refitted, shot_of
@@ -177,6 +186,17 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     np.testing.assert_array_equal(measured[:, :2], y[-SAMPLES:, :2])
     rms = np.sqrt((left[:, :2] ** 2).mean(axis=0)) / noise.rms()[:2]
     np.testing.assert_allclose(rms, 1, atol=0.1)
+
+
+@pytest.mark.parametrize("few", [3, 60])
+def test_a_run_begins_at_a_window_with_many_samples(of, few):
+    length = of.blocks[0].y.shape[1] - of.blocks[0].lead
+    u = drive(2 * length + few * length // 100)
+    y, level = colored(exact(u), 0)
+    cut = bench(y, level, u=u)
+    frozen = cut._replace(tolerance=np.full(9, FIXED))
+    _, start = _run_on(refitted(frozen, Hypothesis()), frozen, record(u, y), 0)
+    assert start == (2 if few > 50 else 1) * length - cut.blocks[0].lead
 
 
 def test_windows_begin_anew():

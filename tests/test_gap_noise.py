@@ -6,7 +6,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, record
 from scipy.signal import lfilter
 
 from jaxsid.checks import InputError
-from jaxsid.gap.noise import noise_of, period_of, quiet_part, residual_noise
+from jaxsid.gap.noise import Noise, lesser, noise_of, period_of, quiet_part, residual_noise
 
 LEVEL = 0.05
 
@@ -47,6 +47,21 @@ def test_residual():
     (noise,) = noise_of(chain(), [record(u, exact(u) + white)])
     assert (noise.source, noise.degrees) == ("residual", 0)
     np.testing.assert_allclose(noise.level, LEVEL, rtol=0.2)
+
+
+def test_the_lesser_of_two_guesses_sensor_by_sensor():
+    white, colored = (
+        np.array([1.0, 0.0]),
+        np.array([1.0, -0.9]),
+    )  # the rms of the second is 2.3 times its level
+    one = Noise(np.array([1.0, 2.0, np.nan, 1.0]), np.tile(white, (4, 1)), 0.0, "residual")
+    other = Noise(
+        np.array([0.5, 3.0, np.nan, 0.6]), np.stack([white, white, white, colored]), 0.0, "residual"
+    )
+    found = lesser(one, other)
+    np.testing.assert_array_equal(found.level, [0.5, 2.0, np.nan, 1.0])
+    np.testing.assert_array_equal(found.taps, np.tile(white, (4, 1)))
+    assert lesser(other, one).rms()[:2].tolist() == found.rms()[:2].tolist()
 
 
 def test_an_effect_is_not_taken_for_noise():

@@ -1,5 +1,6 @@
 """Windows, unknowns and fits by simulation: against plain indices, closed forms, finite differences, SciPy, truth."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,12 +12,24 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from jaxsid import Record
-from jaxsid.gap.hypothesis import coordinates_of, parameter_rows, shifts_of
+from jaxsid.gap.fit import Fit
+from jaxsid.gap.hypothesis import FIXED, coordinates_of, parameter_rows, shifts_of
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of
+from jaxsid.gap.refit import (
+    Hypothesis,
+    Refit,
+    _prior,
+    _with_own,
+    loudest,
+    refitted,
+    shot_of,
+    states_without,
+    weighed_anew,
+)
 from jaxsid.gap.setting import slowest_rate
 from jaxsid.gap.shooting import parameters_of, products_of
-from jaxsid.gap.windows import LEAD, LONGEST, SHORTEST, blocks_of, window_length
+from jaxsid.gap.windows import BLOCKS, LEAD, LONGEST, SHORTEST, blocks_of, window_length
+from jaxsid.impulse.whitening import MOST
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS
 from jaxsid.mechanics.effects.prior import Amplitudes
 from jaxsid.mechanics.lumped import Connection, Effect, Input, Sensor, lumped_model, second_order
@@ -329,6 +342,68 @@ def test_a_start_that_diverges_has_no_evidence(cubic):
     assert found.fit.squares == np.inf
     assert not found.fit.settled
     assert found.fit.steps == 1
+
+
+def test_states_make_room_for_effects():
+    plain, own = np.arange(12.0).reshape(2, 6), np.array([[1.0, 2.0], [3.0, 4.0]])
+    grown = _with_own(np.hstack([plain, own]), 6, 3)
+    np.testing.assert_array_equal(grown[:, :6], plain)
+    np.testing.assert_array_equal(grown[:, 6:], [[1, 0, 0, 2, 0, 0], [3, 0, 0, 4, 0, 0]])
+    np.testing.assert_array_equal(_with_own(grown, 6, 1), np.hstack([plain, own]))
+    np.testing.assert_array_equal(_with_own(plain, 6, 1), np.pad(plain, ((0, 0), (0, 2))))
+
+
+@pytest.mark.parametrize("loud", [0, 1])
+def test_the_loudest_block_is_the_one_that_is_missed_most(loud):
+    u = drive(2 * BLOCKS[-1])
+    y, level = colored(exact(u), 0)
+    y[loud * BLOCKS[-1] + np.arange(BLOCKS[-1] // 2)] += 3 * level
+    of = bench(y, level, u=u)
+    assert len(of.blocks) == 2
+    frozen = of._replace(tolerance=np.full(9, FIXED))
+    part = loudest(frozen, refitted(frozen, Hypothesis()))
+    assert part.blocks[0] is of.blocks[loud]
+    assert part.states[0] is of.states[loud]
+
+
+@pytest.mark.parametrize("part", [0.5, 2.0])
+def test_noise_is_no_more_than_was_thought_until_nothing_else_is_left(part):
+    """What a fit leaves may be more than noise, but not less."""
+    y, level = colored(exact(drive()), 0)
+    guess = known(level / part)
+    taps = np.pad(guess.taps, ((0, 0), (0, MOST + 1 - guess.taps.shape[1])))
+    guess = Noise(guess.level, taps, 0.0, "residual")
+    of = bench(y, level)
+    blocks = tuple(
+        eqx.tree_at(
+            lambda b: (b.weight, b.taps), b, (b.weight * part, jnp.tile(jnp.asarray(taps), (len(b.y), 1, 1)))
+        )
+        for b in of.blocks
+    )
+    frozen = of._replace(tolerance=np.full(9, FIXED), noises=(guess,), blocks=blocks)
+    found = refitted(frozen, Hypothesis())
+    ratio = {}
+    for noise in (False, True):
+        new = weighed_anew(frozen, found, noise=noise)
+        ratio[noise] = new.noises[0].rms() / known(level).rms()
+        seen = np.asarray(new.blocks[0].weight).max(axis=(0, 1))
+        np.testing.assert_allclose(seen, 1 / new.noises[0].level, rtol=1e-12)
+    np.testing.assert_allclose(ratio[True], 1, atol=0.15)
+    np.testing.assert_allclose(ratio[False], ratio[True] if part < 1 else 1 / part)
+
+
+def test_states_without_an_effect(cubic):
+    effects = (
+        effect("cubic_stiffness", ("b1", "b2"), coefficient=1e6),
+        effect("sensor_gain", "s2", factor=1.0),
+    )
+    shot = shot_of(cubic, effects)
+    nothing = np.zeros(1)
+    states = (np.arange(20.0).reshape(2, 10),)
+    of = Refit(Hypothesis(effects), Fit(nothing, states, 0.0, 1, np.eye(1), 0.0, 1, True), None, (), shot)
+    (first,), (last,) = (states_without(of, i) for i in range(2))
+    np.testing.assert_array_equal(first[0], [0, 1, 2, 3, 4, 5, 7, 9])
+    np.testing.assert_array_equal(last[0], [0, 1, 2, 3, 4, 5, 6, 8])
 
 
 @pytest.mark.slow

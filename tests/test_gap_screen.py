@@ -20,7 +20,7 @@ from gap_helpers import (
 
 import jaxsid
 from jaxsid.gap.dictionary import columns
-from jaxsid.gap.grids import WIDTHS, plan_of
+from jaxsid.gap.grids import RESONANCES, WIDTHS, plan_of, quantiles
 from jaxsid.gap.noise import noise_of
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, beside, recalibrated
@@ -141,6 +141,11 @@ def test_plans_say_how_parameters_enter():
     assert plan_of("cogging_ripple")[:4] == ((0,), False, 2, None)
     assert plan_of("periodic_disturbance").frequency == 1
     assert plan_of("missing_mode").whole
+    # a sharp resonance is found by a fit that begins within a few percent of its frequency
+    stiffness = np.unique(quantiles(CATALOGUE["missing_mode"].parameters[1].prior, RESONANCES[0]))
+    steps = np.sqrt(stiffness[1:] / stiffness[:-1])
+    assert 1 < steps.max() < 1.09
+    assert np.sqrt(stiffness[-1] / stiffness[0]) > 90
     for name in ("backlash", "sensor_delay", "actuator_lag", "actuator_saturation"):
         assert not plan_of(name).proportional
 

@@ -122,7 +122,7 @@ def test_bad_studies_and_options(finished, tmp_path, monkeypatch):
     file.write_text(STUDY.replace("0.05", "0.06"))
     refused(call(file, "--out", folder / "out"), "holds another study", "0.06")
     monkeypatch.setattr(html, "find_spec", lambda name: None if name == "pyarrow" else True)
-    refused(call(file, "--out", out), "A study needs pyarrow", 'pip install "jaxsid[study]"')
+    refused(call(file, "--out", out), "A study needs pyarrow", 'pip install ".[study]"')
     assert not list(out.glob("parts/*/*.parquet"))
 
 

@@ -21,6 +21,7 @@ from jaxsid.gap.explain import (
     Ranking,
     element_place,
     elements_by_key,
+    extended,
     key_of,
     rank,
 )
@@ -38,6 +39,7 @@ from jaxsid.gap.refit import (
     bench_of,
     changes_of,
     refitted,
+    states_without,
     tied,
     weighed_anew,
 )
@@ -54,6 +56,7 @@ OFF = 2.5  # tolerances from which on a number may be wrong
 PLACES = 2  # of one kind that are tried before other kinds, where something was found already
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.01  # and of all that is left
+MOST_TURNS = 5  # of asking again
 
 
 class Causes(NamedTuple):
@@ -66,9 +69,10 @@ class Causes(NamedTuple):
         nominal, recalibrated: the model as it is, and the best linear one, fitted the same way.
         closures: of every selected effect together with those before it, on held-out samples; of the model within
             its tolerance where none was selected.
-        left: what the chosen model leaves of these.
-        before: what the nominal model and the best linear one leave of these.
-        noises: of each record, from what the chosen model leaves where tests find nothing in it.
+        lefts: what each of these leaves of these samples.
+        linear: how far the gap shrinks with the best linear model alone.
+        before: what the nominal model and the best linear one leave of these samples.
+        noises: of each record; from what the chosen model leaves where nothing else tells of it.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
     """
@@ -79,11 +83,28 @@ class Causes(NamedTuple):
     nominal: Refit
     recalibrated: Refit
     closures: tuple[Closure, ...]
-    left: Left
+    lefts: tuple[Left, ...]
+    linear: Closure
     noises: tuple[Noise, ...]
     remaining: Null
     places: Scored | None
     before: tuple[Left, Left]
+
+    def first(self, count: int) -> "Causes":
+        """The same with the first effects only; with the best linear model where there are none.
+
+        Args:
+            count: how many.
+        """
+        if count == len(self.selected):
+            return self
+        selected, closures, lefts = self.selected[:count], self.closures[:count], self.lefts[:count]
+        return self._replace(
+            selected=selected,
+            chosen=selected[-1].refit if selected else self.recalibrated,
+            closures=closures or (self.linear,),
+            lefts=lefts or self.before[1:],
+        )
 
 
 class _Look(NamedTuple):
@@ -141,22 +162,22 @@ def causes_of(
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
     say("how far the gap shrinks")
-    # what is left is noise where tests find nothing in it; else it may be less
-    floor = bench.noises if look.clear else found.noises
     lefts = partial(left_of, bench=bench, records=whole, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
+    *each, alone = (closure_of(*ends, x, bench.noises, names) for x in (*steps, ends[1]))
     return Causes(
         rounds,
         chosen,
         tuple(selected),
         plain,
         linear,
-        tuple(closure_of(*ends, x, floor, names) for x in steps),
-        steps[-1],
-        floor,
+        tuple(each),
+        tuple(steps),
+        alone,
+        bench.noises,
         look.null,
         None if look.clear else look.scored,
         ends,
@@ -176,10 +197,11 @@ class _Found(NamedTuple):
         """With the best of a round, fitted to the very bottom, its noise what is left there."""
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
         for again in (False, True):
-            bench = weighed_anew(bench, last) if again else bench
+            bench = weighed_anew(bench, last, noise=False) if again else bench
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
             bench, last = tied(bench, last, steps=POLISHED)
+        bench = bench._replace(states=last.fit.states)
         rounds = (*self.rounds[: len(self.selected)], ranking)
         return _Found(bench, self.look, rounds, (*self.selected, best._replace(refit=last)), last)
 
@@ -208,7 +230,19 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
         candidates = tuple(c for pair in zip(now, _varied(first), strict=False) for c in pair)
-    return _needed(at, model, seen, say)
+    return _settled(_reconsidered(at, model, seen, say))
+
+
+def _settled(at: _Found) -> _Found:
+    """With the noise what is left, where that is nothing else."""
+    if not at.selected or not at.look.clear:
+        return at
+    assert at.before is not None
+    bench = weighed_anew(at.bench, at.before, noise=True)
+    start = {"changes": changes_of(at.before, bench), "states": at.before.fit.states}
+    last = refitted(bench, at.before.hypothesis, **start, steps=POLISHED)
+    selected = (*at.selected[:-1], at.selected[-1]._replace(refit=last))
+    return at._replace(bench=bench, before=last, selected=selected)
 
 
 def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -239,24 +273,85 @@ def _further(
     return at._replace(look=_looked(model, seen, at))
 
 
-def _needed(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
-    """Without the effects that those found later have made needless."""
-    errors = elements_by_key(model)
-    for x in at.selected[:-1]:
-        before, last = at.before, at.rounds[-1]
-        assert before is not None
-        effects = tuple(e for e in before.hypothesis.effects if key_of(e.kind, dict(e.place)) != x.key)
-        wrong = tuple(i for i in before.hypothesis.wrong if i not in errors.get(x.key, ()))
-        say(f"whether {x.kind} is needed")
-        without = refitted(at.bench, Hypothesis(effects, wrong), changes=changes_of(before, at.bench))
-        if (before.fit.evidence - without.fit.evidence) / last.scale / last.temperature > WORTH:
-            continue
-        kept = [i for i, y in enumerate(at.selected) if y.key != x.key]
-        selected = [at.selected[i] for i in kept]
+def _reconsidered(
+    at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]
+) -> _Found:
+    """Every effect but the last beside those found later: left out, or another of its round in its place.
+
+    While a later effect was still to be found others may have come first for what they took of it. Where one has
+    changed, those beside it are asked again.
+    """
+    due, before = [x.key for x in at.selected[:-1]], at.selected
+    for _ in range(MOST_TURNS):
+        if not due:
+            break
+        i = [x.key for x in at.selected].index(due.pop(0))
+        at, changed = _turn(at, i, model, say)
+        if changed:
+            due = [x.key for j, x in enumerate(at.selected) if j != i] if len(at.selected) > 1 else []
+    same = [x.key for x in before] == [x.key for x in at.selected]
+    return at if same else at._replace(look=_looked(model, seen, at))
+
+
+def _turn(at: _Found, i: int, model: LumpedModel, say: Callable[[str], None]) -> tuple[_Found, bool]:
+    """One effect asked again beside all others, and whether that changes anything."""
+    x = at.selected[i]
+    say(f"{x.kind} beside the others")
+    without, states = _without(at, x, model)
+    assert at.before is not None
+    every = (x._replace(refit=at.before), *(y for y in at.rounds[i].ranked if y.key != x.key))
+    ranking = rank(at.bench._replace(states=states), [_again(y) for y in every], without, FURTHER, say)
+    rounds, selected = list(at.rounds), list(at.selected)
+    if ranking.gain <= WORTH:
+        del rounds[i], selected[i]
         selected[-1] = selected[-1]._replace(refit=without)
-        at = at._replace(rounds=tuple(at.rounds[i] for i in kept), selected=tuple(selected), before=without)
-        at = at._replace(look=_looked(model, seen, at))
-    return at
+        return at._replace(rounds=tuple(rounds), selected=tuple(selected), before=without), True
+    if ranking.ranked[0].key == x.key:
+        rounds[i] = ranking
+        selected[i] = x._replace(probability=ranking.ranked[0].probability)
+        return at._replace(rounds=tuple(rounds), selected=tuple(selected)), False
+    other = _in_place(at, i, ranking)
+    return (at, False) if other is None else (other, True)
+
+
+def _without(at: _Found, x: Explanation, model: LumpedModel) -> tuple[Refit, tuple[np.ndarray, ...]]:
+    """What was found, less one effect; and the states of windows where it is there, to begin from with another."""
+    assert at.before is not None
+    of = at.before.hypothesis
+    gone = [i for i, e in enumerate(of.effects) if key_of(e.kind, dict(e.place)) == x.key]
+    states = states_without(at.before, gone[0]) if gone else at.before.fit.states
+    effects = tuple(e for i, e in enumerate(of.effects) if i not in gone)
+    wrong = tuple(i for i in of.wrong if i not in elements_by_key(model).get(x.key, ()))
+    start = {"changes": changes_of(at.before, at.bench), "states": states}
+    return refitted(at.bench, Hypothesis(effects, wrong), **start), states
+
+
+def _again(x: Explanation) -> Candidate:
+    """A fitted explanation to begin anew from."""
+    own = [e for e in x.refit.hypothesis.effects if key_of(e.kind, dict(e.place)) == x.key]
+    parameters = {n: float(np.ravel(np.asarray(v))[0]) for e in own for n, v in e.parameters.items()}
+    return Candidate(x.kind, x.place, parameters, np.zeros(0), x.evidence, np.nan, "", {})
+
+
+def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found | None:
+    """With the best of a round in the place of the effect that was found i-th; None where that is no better."""
+    assert at.before is not None
+    new = _Found(ranking.bench, at.look, (), (), None).taken(ranking)
+    assert new.before is not None
+    old = refitted(new.bench, at.before.hypothesis, changes=changes_of(at.before, new.bench), steps=POLISHED)
+    if old.fit.evidence >= new.before.fit.evidence:
+        return None
+    rounds, selected = list(at.rounds), list(at.selected)
+    rounds[i], selected[i] = ranking, new.selected[0]
+    hypothesis, errors = Hypothesis(), elements_by_key(new.bench.model)
+    for j, x in enumerate(selected):
+        hypothesis = extended(hypothesis, _again(x._replace(refit=new.before)), errors)
+        last = j == len(selected) - 1
+        fit = (
+            new.before if last else refitted(new.bench, hypothesis, changes=changes_of(new.before, new.bench))
+        )
+        selected[j] = x._replace(refit=fit)
+    return new._replace(rounds=tuple(rounds), selected=tuple(selected))
 
 
 def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:

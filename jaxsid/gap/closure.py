@@ -132,10 +132,15 @@ def _judged(block: Block, x: Array | np.ndarray) -> np.ndarray:
 
 def _run_on(found: Refit, bench: Bench, record: Record, number: int) -> tuple[Run, int]:
     """The motion from the last window that was fitted to the record's end, and the number of its first sample."""
-    i = max(i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number)
+    shares = {
+        (i, row): float(share)
+        for i, b in enumerate(bench.blocks)
+        if int(b.record[0]) == number
+        for row, share in enumerate((np.asarray(b.weight)[:, b.lead :] > 0).any(axis=2).mean(axis=1))
+    }
+    # of a last window with few samples the state is hardly known
+    i, last = max(at for at, share in shares.items() if share >= 0.5 * max(shares.values()))
     block = bench.blocks[i]
-    judged = np.asarray(block.weight)[:, block.lead :] > 0
-    last = int(np.flatnonzero(judged.any(axis=(1, 2)))[-1])
     u, first = np.asarray(ordered_inputs(bench.model, record)[0]), int(block.first[last])
     given = {"record": number, "first": first, "substeps": bench.substeps}
     state = found.fit.states[i][last]

@@ -24,7 +24,7 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.refit import Refit
-from jaxsid.gap.verdict import Verdict, as_pair, plain_place, verdict_of
+from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
 from jaxsid.gap.words import next_experiment, remaining, summary
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.first_order import physical_displacement_velocity
@@ -169,7 +169,10 @@ class Diagnosis(NamedTuple):
         ]
 
     def selected(self) -> list[dict[str, Any]]:
-        """The best explanation, one effect after another; empty where nothing was found."""
+        """The best explanation, one effect after another; empty where nothing was found.
+
+        Beside what is unknown, effects that act elsewhere and explain much by themselves.
+        """
         if self.causes is None or self.verdict == "none":
             return []
         if not self.causes.selected:
@@ -178,7 +181,6 @@ class Diagnosis(NamedTuple):
         return [
             {**as_pair(x), "parameters": self._parameters(x, chosen), "gap_after": closure.by_sensor}
             for x, closure in zip(self.causes.selected, self.causes.closures, strict=True)
-            if self.verdict != "unknown"
         ]
 
     def _others(self) -> dict[str, Any]:
@@ -269,7 +271,7 @@ def diagnose(
     causes = (
         causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
     )
-    verdict = verdict_of(found, causes)
+    causes, verdict = concluded(found, causes)
     said = _warnings(model, seen, found, verdict, initial == "rest")
     return Diagnosis(
         model, records, found, causes, verdict, _experiment(model, seen, causes, verdict, progress), said

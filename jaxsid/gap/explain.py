@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted, tied, weighed_anew
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, loudest, refitted, tied, weighed_anew
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
@@ -21,7 +21,7 @@ from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
 MILD = 2.0  # of the model's numbers, whose equations are known
-ROUGH_STEPS, STEPS_A_NUMBER, ROUGH_BLOCKS = 6, 3, 1  # laws of many numbers take longer to be found
+ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
@@ -156,8 +156,8 @@ def rank(
     say = progress or (lambda text: None)
     errors = elements_by_key(bench.model)
     base = before.hypothesis if before is not None else Hypothesis()
-    part = bench.part(ROUGH_BLOCKS)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
+    part = loudest(bench, without)
     rough = []
     for c in _distinct(candidates, base, errors)[: effort.tried]:
         say(f"{c.kind} at {_label(c.place)}")
@@ -180,11 +180,16 @@ def rank(
         bench, done[0], more = _weighed(bench, rough[0][1], effort)
         ratio = ratio * more
         without = refitted(bench, base, **_from(without, bench))
+        without = tied(bench, without, steps=effort.steps, gain=FINE)[1]
+
+    benches = dict.fromkeys(done, bench)
 
     def thoroughly(i: int) -> None:
         c, r = rough[i]
         say(f"{c.kind} at {_label(c.place)}, thoroughly")
-        done[i] = refitted(bench, r.hypothesis, changes=changes_of(r, bench), steps=effort.steps, gain=FINE)
+        new = refitted(bench, r.hypothesis, changes=changes_of(r, bench), steps=effort.steps, gain=FINE)
+        # what drifts away with one law need not with another
+        benches[i], done[i] = tied(bench, new, steps=effort.steps, gain=FINE)
 
     for i, (_, r) in enumerate(rough[: effort.refined]):
         if i not in done and (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
@@ -196,7 +201,7 @@ def rank(
         thoroughly(i)
     last = dict(enumerate(r for _, r in rough)) | done
     every = [(c, last[i], values[i]) for i, (c, _) in enumerate(rough)]
-    return _ranked(every, without, bench, effort.temperature)
+    return _ranked(every, without, benches[int(np.argmax(values))] if done else bench, effort.temperature)
 
 
 def _weighed(bench: Bench, found: Refit, effort: Effort) -> tuple[Bench, Refit, float]:
@@ -207,11 +212,10 @@ def _weighed(bench: Bench, found: Refit, effort: Effort) -> tuple[Bench, Refit, 
     best = refitted(bench, found.hypothesis, changes=changes_of(found, bench), steps=effort.steps, gain=FINE)
     ratio = 1.0
     if any(n.degrees <= 0 for n in bench.noises):
-        bench, ratio = (
-            weighed_anew(bench, best),
-            best.fit.equations / max(best.fit.squares, np.finfo(float).tiny),
-        )
+        # more may be missing than this one, so that noise is no more than was thought
+        bench, before = weighed_anew(bench, best, noise=False), best.fit.squares
         best = refitted(bench, best.hypothesis, **_from(best, bench), steps=effort.steps, gain=FINE)
+        ratio = best.fit.squares / max(before, np.finfo(float).tiny)
     return *tied(bench, best, steps=effort.steps, gain=FINE), ratio
 
 

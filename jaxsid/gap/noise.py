@@ -208,6 +208,17 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 
+def lesser(one: Noise, other: Noise) -> Noise:
+    """Of every sensor the one whose rms is less, two guesses neither of which can be too low by much.
+
+    Args:
+        one, other: of one record.
+    """
+    first = ~(other.rms() < one.rms())
+    level, taps = np.where(first, one.level, other.level), np.where(first[:, None], one.taps, other.taps)
+    return Noise(level, taps, 0.0, one.source)
+
+
 def floor(spectra: Spectra) -> Noise:
     """White noise of the level of the quietest band of what a model leaves.
 

@@ -20,7 +20,7 @@ from jaxsid.gap.hypothesis import (
     shifts_of,
     with_parameters,
 )
-from jaxsid.gap.noise import Noise, residual_noise
+from jaxsid.gap.noise import Noise, lesser, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
@@ -48,7 +48,8 @@ class Bench(NamedTuple):
     Attributes:
         model: nominal, without effects.
         blocks: of windows.
-        states: of every block (windows, 2 N), those of the best linear model.
+        states: of every block (windows, 2 N, then those of effects found), to begin with: at first those of the best
+            linear model.
         moved: how the bodies move in every record.
         tolerance: (e,) standard deviations of the elements' relative changes.
         wide: (e,) likewise, of elements that are wrong.
@@ -81,19 +82,6 @@ class Bench(NamedTuple):
         size = len(self.still) // 2
         own = np.repeat([self.still[:size].max(), self.still[size:].max()], slots)
         return np.concatenate([self.still, own])
-
-    def part(self, blocks: int) -> "Bench":
-        """The same with some blocks only, from all along the records.
-
-        Args:
-            blocks: how many.
-        """
-        chosen = np.unique(
-            np.linspace(0, len(self.blocks) - 1, min(blocks, len(self.blocks))).round().astype(int)
-        )
-        return self._replace(
-            blocks=tuple(self.blocks[i] for i in chosen), states=tuple(self.states[i] for i in chosen)
-        )
 
 
 class Hypothesis(NamedTuple):
@@ -195,23 +183,25 @@ def _substeps(model: LumpedModel, dt: float) -> int:
     return int(np.clip(np.ceil(STEPS_A_PERIOD * quickest * dt / (2 * np.pi)), 1, MOST_SUBSTEPS))
 
 
-def weighed_anew(bench: Bench, found: Refit) -> Bench:
+def weighed_anew(bench: Bench, found: Refit, *, noise: bool) -> Bench:
     """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
 
     Args:
         bench: records.
         found: a fit to all of it.
+        noise: whether what it leaves is noise; else noise is that, or what it was taken for before, whichever is less.
     """
     lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
     noises, blocks = list(bench.noises), list(bench.blocks)
-    for number, noise in enumerate(bench.noises):
+    for number, old in enumerate(bench.noises):
         own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
         seen = np.concatenate([np.asarray(blocks[i].weight)[:, blocks[i].lead :] > 0 for i in own])
         left = np.concatenate([lefts[i][:, blocks[i].lead :] for i in own])
         whole = np.all(seen.any(axis=2), -1)
-        if noise.degrees > 0 or whole.sum() == 0:
+        if old.degrees > 0 or whole.sum() == 0:
             continue
-        noises[number] = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
+        new = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
+        noises[number] = new if noise else lesser(old, new)
         level = noises[number].level
         inverse = jnp.asarray(
             np.where(np.isfinite(level) & (level > 0), 1 / np.where(level > 0, level, 1.0), 0.0)
@@ -259,6 +249,41 @@ def in_windows(bench: Bench, found: Refit) -> list[Products]:
     return products_of(found.shot, bench.blocks, found.fit.theta, found.fit.states, bench.substeps)
 
 
+def loudest(bench: Bench, found: Refit) -> Bench:
+    """The one block of which a fit leaves most, in noise: what the fit lacks is at work there.
+
+    Args:
+        bench: that it was fitted to.
+        found: the fit.
+    """
+    parts = zip(bench.blocks, in_windows(bench, found), strict=True)
+    left = [float(((np.asarray(x.left) * np.asarray(b.weight))[:, b.lead :] ** 2).sum()) for b, x in parts]
+    i = int(np.argmax(left))
+    return bench._replace(blocks=(bench.blocks[i],), states=(bench.states[i],))
+
+
+def states_without(found: Refit, row: int) -> tuple[Float[np.ndarray, "windows n"], ...]:
+    """States of every block of a fit, without those of one effect.
+
+    Args:
+        found: the fit.
+        row: number of the effect.
+    """
+    slots = found.shot.slots.count
+    kept = [i for i in range(slots) if i != row]
+    parts = ((s[:, : -2 * slots], s[:, -2 * slots :].reshape(len(s), 2, slots)) for s in found.fit.states)
+    return tuple(
+        np.concatenate([plain, own[:, :, kept].reshape(len(own), -1)], axis=1) for plain, own in parts
+    )
+
+
+def _with_own(states: np.ndarray, plain: int, slots: int) -> np.ndarray:
+    """States with room for those of so many effects, displacements then velocities; further ones begin at rest."""
+    own = states[:, plain:].reshape(len(states), 2, -1)[:, :, :slots]
+    own = np.pad(own, ((0, 0), (0, 0), (0, slots - own.shape[2])))
+    return np.concatenate([states[:, :plain], own.reshape(len(states), -1)], axis=1)
+
+
 def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:
     at = np.asarray(block.first)
     return np.where((at >= 0)[:, None], motion[np.clip(at, 0, len(motion) - 1)], 0.0)
@@ -280,7 +305,7 @@ def refitted(
         bench: records.
         hypothesis: effects with parameters to begin with.
         changes: of elements to begin with; none where left out.
-        states: of every block, hidden ones too, to begin with; else those of the best linear model.
+        states: of every block, hidden ones too, to begin with; else those of the bench.
         steps: most evaluations.
         gain: of the search, below which it has come to an end.
     """
@@ -291,8 +316,8 @@ def refitted(
     prior = _prior(bench, hypothesis, shot)
     start = np.zeros(len(bench.tolerance)) if changes is None else np.asarray(changes)
     theta = np.concatenate([start, z.ravel(), shifts_of(effects, bench.records)])
-    own = 2 * slots.count
-    given = [np.pad(s, ((0, 0), (0, own))) for s in bench.states] if states is None else list(states)
+    plain = 2 * len(bench.model.bodies)
+    given = [_with_own(s, plain, slots.count) for s in (bench.states if states is None else states)]
     # all but laws is integrated exactly
     laws = any(sort_of(CATALOGUE[e.kind]) != "linear" for e in effects)
     search = {"substeps": bench.substeps if laws else 1, "steps": steps, "gain": gain}

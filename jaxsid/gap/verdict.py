@@ -1,19 +1,24 @@
 """What is concluded from explanations that were fitted: whether they explain enough, and which cannot be told apart."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsid.gap.causes import SLIGHT, Causes
+from jaxsid.gap.closure import fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import Explanation
+from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
+from jaxsid.mechanics.lumped import GROUND
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
+MOST = 0.5  # part of what was left that an effect beside an unknown one explains
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
 
@@ -29,6 +34,20 @@ class Verdict(NamedTuple):
     name: str
     probability: dict[str, float]
     likely: tuple[tuple[Explanation, ...], ...]
+
+
+def concluded(found: Examination, causes: Causes | None) -> tuple[Causes | None, Verdict]:
+    """The verdict, and what of the causes it leaves standing: a stand-in for an unknown law is no effect found.
+
+    Args:
+        found: the examination of the gap.
+        causes: what explains it; None where it agrees with noise.
+    """
+    verdict = verdict_of(found, causes)
+    if causes is None or verdict.name != "unknown":
+        return causes, verdict
+    kept = _beside(causes)
+    return causes.first(kept), verdict._replace(likely=verdict.likely[:kept])
 
 
 def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
@@ -67,6 +86,26 @@ def _unexplained(causes: Causes) -> float:
         return 1.0
     gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
     return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
+
+
+def _beside(causes: Causes) -> int:
+    """How many of the first effects act elsewhere than what is left, and took away most of what was there."""
+    if not causes.selected or causes.places is None:
+        return 0
+    left_at = {_ends(p.as_dict()) for p in located(causes.places).likely}
+    gap = causes.linear.after
+    for count, (x, closure) in enumerate(zip(causes.selected, causes.closures, strict=True)):
+        if _ends(x.place) in left_at or fraction(gap, closure.after, closure.noise_floor) < MOST:
+            return count
+        gap = closure.after
+    return len(causes.selected)
+
+
+def _ends(place: Mapping[str, Any]) -> tuple[str, ...]:
+    """A place as one value; a body's motion is that against the ground."""
+    ((where, ends),) = place.items()
+    named = (GROUND, str(ends)) if where == "body" else (ends,) if isinstance(ends, str) else tuple(ends)
+    return ("between" if where == "body" else where, *sorted(named))
 
 
 def _substantial(gap: float, floor: float) -> bool:

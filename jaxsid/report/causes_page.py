@@ -243,7 +243,7 @@ def _by_sensor(x: Left, names: list[str]) -> dict[str, float]:
 
 def _noise_by_sensor(found: Diagnosis, names: list[str]) -> dict[str, float]:
     assert found.causes is not None
-    left, noises = found.causes.left, found.causes.noises
+    left, noises = found.causes.lefts[-1], found.causes.noises
     counts = [np.isfinite(y).sum(axis=0) for y in left.measured]
     power = np.sum([np.nan_to_num(n.rms()) ** 2 * k for n, k in zip(noises, counts, strict=True)], axis=0)
     return dict(zip(names, np.sqrt(power / _spread(left)).tolist(), strict=True))

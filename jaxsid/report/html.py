@@ -41,5 +41,5 @@ def check_installed(*packages: str, user: str = "The report", extra: str = "plot
     missing = [name for name in packages if find_spec(name) is None]
     require(
         not missing,
-        f'{user} needs {" and ".join(missing)}, not installed here. Install it: pip install "jaxsid[{extra}]".',
+        f'{user} needs {" and ".join(missing)}, not installed here. In a checkout of jaxsid: pip install ".[{extra}]".',
     )

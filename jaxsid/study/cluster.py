@@ -164,7 +164,7 @@ def on_cluster(client: Client, jobs: Iterable[Job], *, patience: float = math.in
         if isinstance(error, ImportError) or "deserialization" in str(error):
             raise InputError(
                 f"a worker or the scheduler cannot load what the study needs ({error}). Install the same versions of "
-                'Python and of jaxsid there as here: pip install "jaxsid[study]".'
+                'Python and of jaxsid there as here; in a checkout: pip install ".[study]".'
             ) from error
         raise
 

@@ -67,8 +67,8 @@ def held_out(found: Diagnosis, sensor: str, record: int) -> HeldOut:
     assert found.causes is not None
     causes, given = found.causes, found.records[record]
     row = [s.name for s in found.nominal.sensors].index(sensor)
-    measured = causes.left.measured[record][:, row]
-    nominal, chosen = (measured + x.left[record][:, row] for x in (causes.before[0], causes.left))
+    measured = causes.lefts[-1].measured[record][:, row]
+    nominal, chosen = (measured + x.left[record][:, row] for x in (causes.before[0], causes.lefts[-1]))
     time = (held_out_begin(given) + np.arange(len(measured))) * float(given.dt)
     return HeldOut(time, measured, nominal, chosen, causes.noises[record], row, float(given.dt))
 
@@ -82,7 +82,7 @@ def chosen_name(found: Diagnosis) -> str:
     if found.causes is None or not found.causes.selected:
         return "numbers put right"
     if found.verdict == "unknown":
-        return "best of the catalogue"
+        return "with what is known"
     return "with the effect" if len(found.causes.selected) == 1 else "with the effects"
 
 
@@ -97,7 +97,7 @@ def held_out_pairs(found: Diagnosis, most: int) -> Sequence[tuple[str, int]]:
     names = [s.name for s in found.nominal.sensors]
     sizes = {}
     for record, (y, left) in enumerate(
-        zip(found.causes.left.measured, found.causes.before[0].left, strict=True)
+        zip(found.causes.lefts[-1].measured, found.causes.before[0].left, strict=True)
     ):
         for j, name in enumerate(names):
             seen = np.isfinite(y[:, j]) & np.isfinite(left[:, j])
