@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from gap_bench import bench, colored
-from gap_helpers import JOINT, drive
+from gap_helpers import JOINT, SAMPLES, drive, exact
 from gap_helpers import with_effect as truth
 
 from jaxsid.gap.chain import Chain, Links
-from jaxsid.gap.fit import _evaluated, _normal, links_of
+from jaxsid.gap.fit import _evaluated, _led, _normal, links_of
 from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of, tied
 from jaxsid.mechanics.lumped import Effect
 
@@ -119,3 +119,38 @@ def test_windows_stay_apart_where_the_model_is_wrong(records):
     chained, found = tied(records, linear, steps=25)
     assert found is linear
     assert chained is records
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """Records of the chain itself, and a bench whose windows lead to one another."""
+    of = bench(*colored(exact(drive()), 1), wide=True)
+    return tied(of, refitted(of, Hypothesis()), steps=25)
+
+
+def test_states_alone_follow_at_once_where_all_is_linear(straight):
+    chained, found = straight
+    shot = shot_of(chained, ())
+    links, prior = links_of(chained.blocks), _prior(chained, Hypothesis(), shot)
+    at = lambda states: _evaluated(shot, chained.blocks, links, prior, theta, states, chained.substeps)  # noqa: E731
+    theta = found.fit.theta * 1.5
+    before = at(list(found.fit.states))
+    (moves,) = _led(before, prior, links)
+    after = at([found.fit.states[0] + moves])
+    assert after.cost < before.cost
+    # downhill there is nowhere left to go
+    slopes = [np.abs(_normal(x, prior, links).slopes * prior.states).max() for x in (before, after)]
+    assert slopes[1] < 1e-6 * slopes[0]
+
+
+def test_a_tied_fit_from_far_off_takes_few_steps():
+    """Ties are stiff: without states that follow by themselves the same search takes 22 steps."""
+    u = drive(4 * SAMPLES)
+    of = bench(*colored(exact(u), 1), u=u)._replace(tolerance=np.full(9, 0.05))
+    chained, near = tied(of, refitted(of, Hypothesis()), steps=25)
+    begin = 0.15 * np.array([1, -1, 1, -1, 1, 1, -1, 1, -1])
+    far = refitted(chained, Hypothesis(), changes=begin, states=near.fit.states, steps=60)
+    assert far.fit.settled
+    assert far.fit.steps < 20
+    assert far.fit.evidence == pytest.approx(near.fit.evidence, abs=0.1)
+    np.testing.assert_allclose(far.fit.theta, near.fit.theta, atol=1e-3)

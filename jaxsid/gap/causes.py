@@ -19,11 +19,13 @@ from jaxsid.gap.explain import (
     Effort,
     Explanation,
     Ranking,
+    again,
     element_place,
     elements_by_key,
     extended,
     key_of,
     rank,
+    rank_again,
 )
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored, scored
@@ -53,7 +55,7 @@ SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 6.0  # tempered gain of evidence from which on a further effect is taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
-PLACES = 2  # of one kind that are tried before other kinds, where something was found already
+PLACES = 4  # of one kind that are tried before other kinds, where something was found already
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.01  # and of all that is left
 MOST_TURNS = 5  # of asking again
@@ -196,8 +198,8 @@ class _Found(NamedTuple):
     def taken(self, ranking: Ranking) -> "_Found":
         """With the best of a round, fitted to the very bottom, its noise what is left there."""
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
-        for again in (False, True):
-            bench = weighed_anew(bench, last, noise=False) if again else bench
+        for anew in (False, True):
+            bench = weighed_anew(bench, last, noise=False) if anew else bench
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
             bench, last = tied(bench, last, steps=POLISHED)
@@ -299,8 +301,8 @@ def _turn(at: _Found, i: int, model: LumpedModel, say: Callable[[str], None]) ->
     say(f"{x.kind} beside the others")
     without, states = _without(at, x, model)
     assert at.before is not None
-    every = (x._replace(refit=at.before), *(y for y in at.rounds[i].ranked if y.key != x.key))
-    ranking = rank(at.bench._replace(states=states), [_again(y) for y in every], without, FURTHER, say)
+    others = [y for y in at.rounds[i].ranked if y.key != x.key]
+    ranking = rank_again(at.bench._replace(states=states), at.before, x, others, without, FURTHER, say)
     rounds, selected = list(at.rounds), list(at.selected)
     if ranking.gain <= WORTH:
         del rounds[i], selected[i]
@@ -326,13 +328,6 @@ def _without(at: _Found, x: Explanation, model: LumpedModel) -> tuple[Refit, tup
     return refitted(at.bench, Hypothesis(effects, wrong), **start), states
 
 
-def _again(x: Explanation) -> Candidate:
-    """A fitted explanation to begin anew from."""
-    own = [e for e in x.refit.hypothesis.effects if key_of(e.kind, dict(e.place)) == x.key]
-    parameters = {n: float(np.ravel(np.asarray(v))[0]) for e in own for n, v in e.parameters.items()}
-    return Candidate(x.kind, x.place, parameters, np.zeros(0), x.evidence, np.nan, "", {})
-
-
 def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found | None:
     """With the best of a round in the place of the effect that was found i-th; None where that is no better."""
     assert at.before is not None
@@ -345,7 +340,7 @@ def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found | None:
     rounds[i], selected[i] = ranking, new.selected[0]
     hypothesis, errors = Hypothesis(), elements_by_key(new.bench.model)
     for j, x in enumerate(selected):
-        hypothesis = extended(hypothesis, _again(x._replace(refit=new.before)), errors)
+        hypothesis = extended(hypothesis, again(x, new.before), errors)
         last = j == len(selected) - 1
         fit = (
             new.before if last else refitted(new.bench, hypothesis, changes=changes_of(new.before, new.bench))

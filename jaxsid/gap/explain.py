@@ -40,7 +40,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(10, 2, 16, TEMPERATURE)
+FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(12, 2, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 
@@ -158,19 +158,11 @@ def rank(
     base = before.hypothesis if before is not None else Hypothesis()
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
     part = loudest(bench, without)
-    rough = []
-    for c in _distinct(candidates, base, errors)[: effort.tried]:
-        say(f"{c.kind} at {_label(c.place)}")
-        hypothesis = extended(base, c, errors)
-        start = _changes(before, bench, c.changes)
-        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
-        rough.append((c, refitted(part, hypothesis, changes=start, steps=steps, gain=FINE)))
-    for few, more in LONGER:
-        rough.sort(key=lambda x: -_value(x[1], bench))
-        for i, (c, r) in enumerate(rough[:few]):
-            if not r.fit.settled:
-                rough[i] = c, refitted(part, r.hypothesis, **_from(r, bench), steps=more, gain=FINE)
-    rough.sort(key=lambda x: -_value(x[1], bench))
+    every = [
+        (c, extended(base, c, errors), _changes(before, bench, c.changes))
+        for c in _distinct(candidates, base, errors)[: effort.tried]
+    ]
+    rough = _roughly(part, every, say)
     ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
     top = _value(rough[0][1], bench) if rough else 0.0
@@ -202,6 +194,81 @@ def rank(
     last = dict(enumerate(r for _, r in rough)) | done
     every = [(c, last[i], values[i]) for i, (c, _) in enumerate(rough)]
     return _ranked(every, without, benches[int(np.argmax(values))] if done else bench, effort.temperature)
+
+
+def rank_again(
+    bench: Bench,
+    found: Refit,
+    x: Explanation,
+    others: Sequence[Explanation],
+    without: Refit,
+    effort: Effort,
+    progress: Callable[[str], None] | None = None,
+) -> Ranking:
+    """An effect that was found next to others in its place, beside all that is there now.
+
+    Args:
+        bench: records; the states to begin with are those of the fit, without what is the effect's own.
+        found: the fit with the effect.
+        x: the effect.
+        others: explanations that were tried where it was found.
+        without: the fit without it.
+        effort: how much is fitted.
+        progress: called with a line of text before each fit.
+    """
+    say = progress or (lambda text: None)
+    errors, begin = elements_by_key(bench.model), changes_of(found, bench)
+    own = again(x, found)
+    candidates = [own, *_distinct([again(y, y.refit) for y in others], found.hypothesis, errors)]
+    part = loudest(bench, without)
+    every = [(c, extended(without.hypothesis, c, errors), begin) for c in candidates]
+    rough = _roughly(part, every, say)
+    ratio, scale = _ratio(bench, part), found.fit.squares / max(found.fit.equations, 1)
+    top = next(_value(r, bench) for c, r in rough if c is own)
+    last, values = [], []
+    for c, r in rough:
+        behind = (top - _value(r, bench)) * ratio
+        if c is own:
+            fit, value = found, _value(found, bench)
+        elif len(last) <= effort.refined and behind / ratio / scale / effort.temperature < CLOSE:
+            say(f"{c.kind} at {_label(c.place)}, thoroughly")
+            fit = refitted(bench, r.hypothesis, changes=begin, steps=effort.steps, gain=FINE)
+            value = _value(fit, bench)
+        else:
+            fit, value = r, found.fit.evidence - max(behind, 0.0)
+        last.append(fit)
+        values.append(value)
+    ranked = [(c, fit, v) for (c, _), fit, v in zip(rough, last, values, strict=True)]
+    return _ranked(ranked, without, bench, effort.temperature)
+
+
+def again(x: Explanation, found: Refit) -> Candidate:
+    """An explanation to begin anew from, with its parameters in a fit.
+
+    Args:
+        x: the explanation.
+        found: the fit.
+    """
+    own = [e for e in found.hypothesis.effects if key_of(e.kind, dict(e.place)) == x.key]
+    parameters = {n: float(np.ravel(np.asarray(v))[0]) for e in own for n, v in e.parameters.items()}
+    return Candidate(x.kind, x.place, parameters, np.zeros(0), x.evidence, math.nan, "", {})
+
+
+def _roughly(
+    part: Bench, every: Sequence[tuple[Candidate, Hypothesis, Any]], say: Callable[[str], None]
+) -> list[tuple[Candidate, Refit]]:
+    """Candidates fitted to a part of the records, best first: some steps for each, more for the best."""
+    rough = []
+    for c, hypothesis, changes in every:
+        say(f"{c.kind} at {_label(c.place)}")
+        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
+        rough.append((c, refitted(part, hypothesis, changes=changes, steps=steps, gain=FINE)))
+    for few, more in LONGER:
+        rough.sort(key=lambda x: -_value(x[1], part))
+        for i, (c, r) in enumerate(rough[:few]):
+            if not r.fit.settled:
+                rough[i] = c, refitted(part, r.hypothesis, **_from(r, part), steps=more, gain=FINE)
+    return sorted(rough, key=lambda x: -_value(x[1], part))
 
 
 def _weighed(bench: Bench, found: Refit, effort: Effort) -> tuple[Bench, Refit, float]:

@@ -99,6 +99,12 @@ def fitted(
             shot, blocks, links, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
         )
         done += 1
+        if links.after.size and np.isfinite(found.cost) and found.cost >= at.cost:
+            # ties are stiff: what bends along the chain is made good by the states alone
+            moves = _led(found, prior, links)
+            states = [a + b for a, b in zip(found.states, moves, strict=True)]
+            found = _evaluated(shot, blocks, links, prior, new, states, substeps)
+            done += 1
         less = at.cost - found.cost
         if less > 0:
             # what has just failed with less damping would fail again
@@ -253,6 +259,13 @@ def _step(at: _At, prior: Prior, links: Links, damping: float) -> tuple[np.ndarr
     move = move / max(1.0, np.abs(move / prior.most).max())
     moves = -back[:, :, p] - np.einsum("wnp,p->wn", back[:, :, :p], move)
     return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
+
+
+def _led(at: _At, prior: Prior, links: Links) -> list[np.ndarray]:
+    """Changes of the states of every block alone, the unknowns as they are."""
+    p = len(at.theta)
+    _, back, _ = _normal(at, prior, links).reduced()
+    return np.split(-back[:, :, p], np.cumsum([len(x) for x in at.states])[:-1])
 
 
 def _solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:

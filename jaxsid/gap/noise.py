@@ -22,6 +22,7 @@ SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, t
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
+COLOUR = 2.0  # rms of coloured noise next to its level in the quietest band, at most
 FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
 
@@ -208,15 +209,20 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 
-def lesser(one: Noise, other: Noise) -> Noise:
-    """Of every sensor the one whose rms is less, two guesses neither of which can be too low by much.
+def believable(guess: Noise, left: Noise) -> Noise:
+    """What a fit leaves of each sensor where that can be noise, else the guess of the quietest band.
 
     Args:
-        one, other: of one record.
+        guess: from `floor`, which colour can put too low, but not by much.
+        left: from `residual_noise`, which may hold more than noise, but no less.
     """
-    first = ~(other.rms() < one.rms())
-    level, taps = np.where(first, one.level, other.level), np.where(first[:, None], one.taps, other.taps)
-    return Noise(level, taps, 0.0, one.source)
+    no_more = ~(left.rms() > COLOUR * guess.rms())
+    return Noise(
+        np.where(no_more, left.level, guess.level),
+        np.where(no_more[:, None], left.taps, guess.taps),
+        0.0,
+        guess.source,
+    )
 
 
 def floor(spectra: Spectra) -> Noise:

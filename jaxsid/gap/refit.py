@@ -20,7 +20,7 @@ from jaxsid.gap.hypothesis import (
     shifts_of,
     with_parameters,
 )
-from jaxsid.gap.noise import Noise, lesser, residual_noise
+from jaxsid.gap.noise import Noise, believable, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
@@ -57,6 +57,7 @@ class Bench(NamedTuple):
         records: how many there are.
         substeps: steps for each sampling interval.
         noises: of each record, that the blocks are weighed by.
+        guesses: what they were to begin with.
         jump: of a state from where a window ends to where the next begins, next to how large states are; infinite where
             each stands alone.
     """
@@ -71,6 +72,7 @@ class Bench(NamedTuple):
     records: int
     substeps: int
     noises: tuple[Noise, ...]
+    guesses: tuple[Noise, ...] = ()
     jump: float = np.inf
 
     def state_deviations(self, slots: int) -> Float[np.ndarray, " m"]:
@@ -172,6 +174,7 @@ def bench_of(
         len(records),
         _substeps(model, max(float(r.dt) for r in records)),
         tuple(noises),
+        tuple(noises),
     )
 
 
@@ -189,7 +192,8 @@ def weighed_anew(bench: Bench, found: Refit, *, noise: bool) -> Bench:
     Args:
         bench: records.
         found: a fit to all of it.
-        noise: whether what it leaves is noise; else noise is that, or what it was taken for before, whichever is less.
+        noise: whether what it leaves is nothing else; else it is taken for noise only where it is little more than
+            the guess.
     """
     lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
     noises, blocks = list(bench.noises), list(bench.blocks)
@@ -201,7 +205,7 @@ def weighed_anew(bench: Bench, found: Refit, *, noise: bool) -> Bench:
         if old.degrees > 0 or whole.sum() == 0:
             continue
         new = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
-        noises[number] = new if noise else lesser(old, new)
+        noises[number] = new if noise else believable(bench.guesses[number], new)
         level = noises[number].level
         inverse = jnp.asarray(
             np.where(np.isfinite(level) & (level > 0), 1 / np.where(level > 0, level, 1.0), 0.0)
