@@ -59,6 +59,7 @@ def bench(y, level, u=None, model=None, wide=False):
         1,
         2,
         (known(level),),
+        (known(level),),
     )
 
 

@@ -21,6 +21,7 @@ from jaxsid.gap.explain import (
     _distinct,
     _ranked,
     _values,
+    again,
     alike,
     elements_by_key,
     extended,
@@ -40,7 +41,7 @@ from jaxsid.physical.elements import element_matrices
 B12, B23 = {"between": ("b1", "b2")}, {"between": ("b2", "b3")}
 
 
-BENCH = Bench(chain(), (), (), (), np.zeros(9), np.zeros(9), np.zeros(6), 1, 2, ())  # of no matter here
+BENCH = Bench(chain(), (), (), (), np.zeros(9), np.zeros(9), np.zeros(6), 1, 2, (), ())  # of no matter here
 
 
 def refit(evidence, squares=1000.0, equations=1000, hypothesis=None):
@@ -56,7 +57,9 @@ def candidate(kind, place, **parameters):
 def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
     kinds = kinds or [("cubic_stiffness", B12), ("backlash", B12), ("end_stop", B12), ("hysteresis", B23)]
     every = [
-        (candidate(*kinds[i]), refit(e, squares), e) for i, e in enumerate(evidences) if not math.isnan(e)
+        (candidate(*kinds[i]), refit(e, squares), e, 1.0)
+        for i, e in enumerate(evidences)
+        if not math.isnan(e)
     ]
     return _ranked(every, refit(without), BENCH, TEMPERATURE)
 
@@ -168,7 +171,7 @@ def test_no_effect_at_all_is_an_alternative_too():
     assert found.ranked[0].probability == pytest.approx(0.5)
     none = _ranked([], refit(0.0), BENCH, TEMPERATURE)
     assert (none.ranked, none.gain) == ((), 0.0)
-    assert _values([], {}, BENCH, 1.0) == []
+    assert _values([], {}, BENCH, BENCH) == []
 
 
 def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
@@ -181,7 +184,7 @@ def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
 def test_a_further_effect_must_be_worth_it():
     def worth(gain, less, before=3000.0):
         best, without = refit(gain, before - less), refit(0.0, before)
-        one = Explanation("backlash", B12, best, gain, 1.0)
+        one = Explanation("backlash", B12, best, gain, 1.0, 1.0)
         return _worth(Ranking((one,), without, 1.0, TEMPERATURE, BENCH))
 
     assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
@@ -227,7 +230,7 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
 
 def explained(kind, place, evidence, effects):
     of = Hypothesis(tuple(Effect(k, tuple(p.items()), {}) for k, p in effects))
-    return Explanation(kind, place, refit(evidence, hypothesis=of), evidence, 0.9)
+    return Explanation(kind, place, refit(evidence, hypothesis=of), evidence, 0.9, 1.0)
 
 
 @pytest.fixture
@@ -253,13 +256,14 @@ def two(monkeypatch):
             first = next((k for k in kinds if k != "hysteresis"), None)
             return refit(value[first] if "hysteresis" in kinds else -500.0, hypothesis=hypothesis)
 
-        def rank(bench, candidates, without, effort, say):
-            asked.append([c.kind for c in candidates])
+        def rank_again(bench, found, x, others, without, effort, say):
+            asked.append([y.kind for y in (x, *others)])
+            candidates = [again(y, y.refit) for y in (x, *others)]
             every = [(c, fitted(bench, extended(without.hypothesis, c, {}))) for c in candidates]
-            return _ranked([(c, r, r.fit.evidence) for c, r in every], without, BENCH, TEMPERATURE)
+            return _ranked([(c, r, r.fit.evidence, 1.0) for c, r in every], without, BENCH, TEMPERATURE)
 
         monkeypatch.setattr(module, "refitted", fitted)
-        monkeypatch.setattr(module, "rank", rank)
+        monkeypatch.setattr(module, "rank_again", rank_again)
         found = _reconsidered(at, chain(), (), lambda text: None)
         assert asked[0] == ["cubic_stiffness", "backlash"]
         return found, asked

@@ -54,7 +54,7 @@ def test_what_grows_with_the_motion_is_told_at_high_level(measured):
     cubic = Effect("cubic_stiffness", PLACE, {"coefficient": 1e6})
     coulomb = Effect("coulomb_friction", PLACE, {"force": 1.0})
     one, other = (
-        Explanation(e.kind, dict(PLACE), refitted(records, Hypothesis((e,))), 0.0, 0.5)
+        Explanation(e.kind, dict(PLACE), refitted(records, Hypothesis((e,))), 0.0, 0.5, 1.0)
         for e in (cubic, coulomb)
     )
     found = experiment_between(one, other, records, [data])

@@ -6,7 +6,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, record
 from scipy.signal import lfilter
 
 from jaxsid.checks import InputError
-from jaxsid.gap.noise import COLOUR, Noise, believable, noise_of, period_of, quiet_part, residual_noise
+from jaxsid.gap.noise import noise_of, period_of, quiet_part, residual_noise
 
 LEVEL = 0.05
 
@@ -47,21 +47,6 @@ def test_residual():
     (noise,) = noise_of(chain(), [record(u, exact(u) + white)])
     assert (noise.source, noise.degrees) == ("residual", 0)
     np.testing.assert_allclose(noise.level, LEVEL, rtol=0.2)
-
-
-def test_what_is_left_is_noise_where_it_is_not_much_more_than_the_guess():
-    white, colored = (
-        np.array([1.0, 0.0]),
-        np.array([1.0, -0.9]),
-    )  # the rms of the second is 2.3 times its level
-    guess = Noise(np.array([1.0, 2.0, np.nan, 1.0]), np.tile(white, (4, 1)), 0.0, "residual")
-    level = np.array([0.99 * COLOUR, 1.0, np.nan, 0.9])
-    left = Noise(level, np.stack([white, white, white, colored]), 0.0, "residual")
-    found = believable(guess, left)
-    np.testing.assert_array_equal(found.level, [0.99 * COLOUR, 1.0, np.nan, 1.0])
-    np.testing.assert_array_equal(found.taps, np.tile(white, (4, 1)))
-    mild = Noise(0.9 * level, left.taps, 0.0, "residual")
-    np.testing.assert_array_equal(believable(guess, mild).taps[3], colored)
 
 
 def test_an_effect_is_not_taken_for_noise():

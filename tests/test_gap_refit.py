@@ -1,6 +1,5 @@
 """Windows, unknowns and fits by simulation: against plain indices, closed forms, finite differences, SciPy, truth."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from jaxsid import Record
+from jaxsid.gap.explain import _density
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.hypothesis import FIXED, coordinates_of, parameter_rows, shifts_of
 from jaxsid.gap.noise import Noise
@@ -20,6 +20,7 @@ from jaxsid.gap.refit import (
     Refit,
     _prior,
     _with_own,
+    as_guessed,
     loudest,
     refitted,
     shot_of,
@@ -366,30 +367,45 @@ def test_the_loudest_block_is_the_one_that_is_missed_most(loud):
     assert part.states[0] is of.states[loud]
 
 
-@pytest.mark.parametrize("part", [0.5, 3.0])
-def test_noise_is_no_more_than_was_thought_until_nothing_else_is_left(part):
-    """What a fit leaves may be more than noise, but no less."""
+def with_guess(of, level):
+    """The same bench, its noise a guess."""
+    guess = Noise(np.asarray(level), np.tile([1.0, *np.zeros(MOST)], (3, 1)), 0.0, "residual")
+    return as_guessed(of._replace(tolerance=np.full(9, FIXED), noises=(guess,), guesses=(guess,)))
+
+
+def test_noise_is_what_a_fit_leaves_and_a_search_begins_with_the_guess():
     y, level = colored(exact(drive()), 0)
-    guess = known(level / part)
-    taps = np.pad(guess.taps, ((0, 0), (0, MOST + 1 - guess.taps.shape[1])))
-    guess = Noise(guess.level, taps, 0.0, "residual")
-    of = bench(y, level)
-    blocks = tuple(
-        eqx.tree_at(
-            lambda b: (b.weight, b.taps), b, (b.weight * part, jnp.tile(jnp.asarray(taps), (len(b.y), 1, 1)))
-        )
-        for b in of.blocks
-    )
-    frozen = of._replace(tolerance=np.full(9, FIXED), noises=(guess,), guesses=(guess,), blocks=blocks)
+    frozen = with_guess(bench(y, level), 3 * level)
     found = refitted(frozen, Hypothesis())
-    ratio = {}
-    for noise in (False, True):
-        new = weighed_anew(frozen, found, noise=noise)
-        ratio[noise] = new.noises[0].rms() / known(level).rms()
-        seen = np.asarray(new.blocks[0].weight).max(axis=(0, 1))
-        np.testing.assert_allclose(seen, 1 / new.noises[0].level, rtol=1e-12)
-    np.testing.assert_allclose(ratio[True], 1, atol=0.15)
-    np.testing.assert_allclose(ratio[False], ratio[True] if part < 1 else 1 / part)
+    anew = weighed_anew(frozen, found)
+    np.testing.assert_allclose(anew.noises[0].rms() / known(level).rms(), 1, atol=0.15)
+    for of in (frozen, anew):
+        weight = np.asarray(of.blocks[0].weight).max(axis=(0, 1))
+        np.testing.assert_allclose(weight, 1 / of.noises[0].level, rtol=1e-12)
+    back = as_guessed(anew._replace(jump=0.1))
+    np.testing.assert_array_equal(back.blocks[0].weight, frozen.blocks[0].weight)
+    np.testing.assert_array_equal(back.blocks[0].taps, frozen.blocks[0].taps)
+    assert back.jump == np.inf
+    # noise that something else tells of stays as it is
+    sure = bench(y, level)
+    assert as_guessed(sure) is sure
+    assert weighed_anew(sure, found).noises == sure.noises
+
+
+def test_density_is_largest_with_the_noise_that_there_is():
+    y, level = colored(exact(drive()), 0)
+    density = {}
+    for part in (0.7, 1.0, 1.4):
+        of = with_guess(bench(y, level), part * known(level).rms())
+        density[part] = _density(of, refitted(of, Hypothesis()))
+        if part == 1.0:
+            anew = weighed_anew(of, refitted(of, Hypothesis()))
+            density["colour"] = _density(anew, refitted(anew, Hypothesis()))
+            count = float((np.asarray(of.blocks[0].weight)[:, of.blocks[0].lead :] > 0).sum())
+    assert density[1.0] > max(density[0.7], density[1.4])
+    # half of log(1 / (1 - POLE^2)) for every value, next to white noise of the same rms
+    gain = (density["colour"] - density[1.0]) / count
+    assert gain == pytest.approx(-0.5 * np.log(1 - POLE**2), rel=0.15)
 
 
 def test_states_without_an_effect(cubic):

@@ -74,7 +74,7 @@ class Causes(NamedTuple):
         lefts: what each of these leaves of these samples.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
-        noises: of each record; from what the chosen model leaves where nothing else tells of it.
+        noises: of each record, from what the chosen model leaves where tests find nothing in it.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
     """
@@ -169,7 +169,9 @@ def causes_of(
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
-    *each, alone = (closure_of(*ends, x, bench.noises, names) for x in (*steps, ends[1]))
+    # what is left is noise where tests find nothing in it; else it may be less
+    floor = bench.noises if look.clear else found.noises
+    *each, alone = (closure_of(*ends, x, floor, names) for x in (*steps, ends[1]))
     return Causes(
         rounds,
         chosen,
@@ -179,7 +181,7 @@ def causes_of(
         tuple(each),
         tuple(steps),
         alone,
-        bench.noises,
+        floor,
         look.null,
         None if look.clear else look.scored,
         ends,
@@ -199,7 +201,7 @@ class _Found(NamedTuple):
         """With the best of a round, fitted to the very bottom, its noise what is left there."""
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
         for anew in (False, True):
-            bench = weighed_anew(bench, last, noise=False) if anew else bench
+            bench = weighed_anew(bench, last) if anew else bench
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
             bench, last = tied(bench, last, steps=POLISHED)
@@ -232,19 +234,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
         candidates = tuple(c for pair in zip(now, _varied(first), strict=False) for c in pair)
-    return _settled(_reconsidered(at, model, seen, say))
-
-
-def _settled(at: _Found) -> _Found:
-    """With the noise what is left, where that is nothing else."""
-    if not at.selected or not at.look.clear:
-        return at
-    assert at.before is not None
-    bench = weighed_anew(at.bench, at.before, noise=True)
-    start = {"changes": changes_of(at.before, bench), "states": at.before.fit.states}
-    last = refitted(bench, at.before.hypothesis, **start, steps=POLISHED)
-    selected = (*at.selected[:-1], at.selected[-1]._replace(refit=last))
-    return at._replace(bench=bench, before=last, selected=selected)
+    return _reconsidered(at, model, seen, say)
 
 
 def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:

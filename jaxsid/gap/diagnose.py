@@ -163,7 +163,7 @@ class Diagnosis(NamedTuple):
                     as_pair(y) for y in ranking.ranked if y.key != x.key and alike(x, y, ranking)
                 ],
                 "round": number,
-                "left": float(np.sqrt(x.refit.fit.squares / max(x.refit.fit.equations, 1))),
+                "left": x.left,
             }
             for x, ranking, number in order
         ]

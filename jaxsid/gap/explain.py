@@ -13,7 +13,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, loudest, refitted, tied, weighed_anew
+from jaxsid.gap.refit import (
+    Bench,
+    Hypothesis,
+    Refit,
+    as_guessed,
+    changes_of,
+    loudest,
+    refitted,
+    tied,
+    weighed_anew,
+)
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
@@ -40,7 +50,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(12, 2, 16, TEMPERATURE)
+FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(12, 3, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 
@@ -51,8 +61,9 @@ class Explanation(NamedTuple):
         kind: of effect.
         place: as of an `Effect`.
         refit: fitted, with the effects found before.
-        evidence: its logarithm, in noise, by the equations of all records.
+        evidence: its logarithm, with noise of its own, up to what all of a round share.
         probability: of all that were tried.
+        left: rms in the noise that the best one leaves.
     """
 
     kind: str
@@ -60,6 +71,7 @@ class Explanation(NamedTuple):
     refit: Refit
     evidence: float
     probability: float
+    left: float
 
     @property
     def key(self) -> Key:
@@ -156,6 +168,7 @@ def rank(
     say = progress or (lambda text: None)
     errors = elements_by_key(bench.model)
     base = before.hypothesis if before is not None else Hypothesis()
+    bench = as_guessed(bench)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
     part = loudest(bench, without)
     every = [
@@ -163,37 +176,20 @@ def rank(
         for c in _distinct(candidates, base, errors)[: effort.tried]
     ]
     rough = _roughly(part, every, say)
-    ratio = _ratio(bench, part)
     scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
     top = _value(rough[0][1], bench) if rough else 0.0
-    done: dict[int, Refit] = {}
-    if rough:
-        say(f"{rough[0][0].kind} at {_label(rough[0][0].place)}, thoroughly")
-        bench, done[0], more = _weighed(bench, rough[0][1], effort)
-        ratio = ratio * more
-        without = refitted(bench, base, **_from(without, bench))
-        without = tied(bench, without, steps=effort.steps, gain=FINE)[1]
-
-    benches = dict.fromkeys(done, bench)
+    done: dict[int, _Whole] = {}
 
     def thoroughly(i: int) -> None:
         c, r = rough[i]
         say(f"{c.kind} at {_label(c.place)}, thoroughly")
-        new = refitted(bench, r.hypothesis, changes=changes_of(r, bench), steps=effort.steps, gain=FINE)
-        # what drifts away with one law need not with another
-        benches[i], done[i] = tied(bench, new, steps=effort.steps, gain=FINE)
+        done[i] = _whole(bench, r.hypothesis, {"changes": changes_of(r, bench)}, effort)
 
     for i, (_, r) in enumerate(rough[: effort.refined]):
-        if i not in done and (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
+        if i == 0 or (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
             thoroughly(i)
-    # what was fitted roughly is not to come first
-    while (values := _values(rough, done, bench, ratio)) and (i := int(np.argmax(values))) not in done:
-        if not math.isfinite(values[i]):
-            break
-        thoroughly(i)
-    last = dict(enumerate(r for _, r in rough)) | done
-    every = [(c, last[i], values[i]) for i, (c, _) in enumerate(rough)]
-    return _ranked(every, without, benches[int(np.argmax(values))] if done else bench, effort.temperature)
+    values = _finished(rough, done, bench, part, thoroughly)
+    return _compared(rough, values, done, bench, without, effort)
 
 
 def rank_again(
@@ -220,26 +216,24 @@ def rank_again(
     errors, begin = elements_by_key(bench.model), changes_of(found, bench)
     own = again(x, found)
     candidates = [own, *_distinct([again(y, y.refit) for y in others], found.hypothesis, errors)]
+    known, bench = _Whole(bench, found), as_guessed(bench)
     part = loudest(bench, without)
     every = [(c, extended(without.hypothesis, c, errors), begin) for c in candidates]
     rough = _roughly(part, every, say)
-    ratio, scale = _ratio(bench, part), found.fit.squares / max(found.fit.equations, 1)
-    top = next(_value(r, bench) for c, r in rough if c is own)
-    last, values = [], []
-    for c, r in rough:
-        behind = (top - _value(r, bench)) * ratio
-        if c is own:
-            fit, value = found, _value(found, bench)
-        elif len(last) <= effort.refined and behind / ratio / scale / effort.temperature < CLOSE:
-            say(f"{c.kind} at {_label(c.place)}, thoroughly")
-            fit = refitted(bench, r.hypothesis, changes=begin, steps=effort.steps, gain=FINE)
-            value = _value(fit, bench)
-        else:
-            fit, value = r, found.fit.evidence - max(behind, 0.0)
-        last.append(fit)
-        values.append(value)
-    ranked = [(c, fit, v) for (c, _), fit, v in zip(rough, last, values, strict=True)]
-    return _ranked(ranked, without, bench, effort.temperature)
+    scale = found.fit.squares / max(found.fit.equations, 1)
+    first = next(i for i, (c, _) in enumerate(rough) if c is own)
+    top, done = _value(rough[first][1], bench), {first: known}
+
+    def thoroughly(i: int) -> None:
+        c, r = rough[i]
+        say(f"{c.kind} at {_label(c.place)}, thoroughly")
+        done[i] = _whole(bench, r.hypothesis, {"changes": begin}, effort)
+
+    for i, (_, r) in enumerate(rough[: effort.refined + 1]):
+        if i != first and (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
+            thoroughly(i)
+    values = _finished(rough, done, bench, part, thoroughly)
+    return _compared(rough, values, done, bench, without, effort)
 
 
 def again(x: Explanation, found: Refit) -> Candidate:
@@ -271,19 +265,43 @@ def _roughly(
     return sorted(rough, key=lambda x: -_value(x[1], part))
 
 
-def _weighed(bench: Bench, found: Refit, effort: Effort) -> tuple[Bench, Refit, float]:
-    """The bench as a rough fit suggests: its noise, where nothing else tells of it, and whether windows are tied.
+class _Whole(NamedTuple):
+    """A fit to all records, and the bench of its own that it was fitted to."""
 
-    Also that fit done thoroughly, and by what factor squares in noise have changed.
+    bench: Bench
+    refit: Refit
+
+
+def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: Effort) -> _Whole:
+    """A hypothesis with the noise that it leaves, where nothing else tells of it, and windows tied if that suits it.
+
+    What drifts away with one law need not with another, nor is what one leaves the noise of another.
     """
-    best = refitted(bench, found.hypothesis, changes=changes_of(found, bench), steps=effort.steps, gain=FINE)
-    ratio = 1.0
-    if any(n.degrees <= 0 for n in bench.noises):
-        # more may be missing than this one, so that noise is no more than was thought
-        bench, before = weighed_anew(bench, best, noise=False), best.fit.squares
-        best = refitted(bench, best.hypothesis, **_from(best, bench), steps=effort.steps, gain=FINE)
-        ratio = best.fit.squares / max(before, np.finfo(float).tiny)
-    return *tied(bench, best, steps=effort.steps, gain=FINE), ratio
+    search = {"steps": effort.steps, "gain": FINE}
+    found = refitted(bench, hypothesis, **start, **search)
+    bench, found = tied(bench, found, **search)
+    if any(n.degrees <= 0 for n in bench.noises) and math.isfinite(found.fit.evidence):
+        bench = weighed_anew(bench, found)
+        found = refitted(bench, found.hypothesis, **_from(found, bench), **search)
+        bench, found = tied(bench, found, **search)
+    return _Whole(bench, found)
+
+
+def _density(bench: Bench, found: Refit) -> float:
+    """Evidence as a density of the records, whatever the noise: log p(y) up to a constant."""
+    return _value(found, bench) + sum(float(np.log(w).sum()) for w in _weights(bench))
+
+
+def _gauge(bench: Bench) -> float:
+    """Mean logarithm of one over the noise."""
+    every = np.concatenate([np.log(w) for w in _weights(bench)])
+    return float(every.mean()) if every.size else 0.0
+
+
+def _weights(bench: Bench) -> list[np.ndarray]:
+    """Of what is judged, block by block."""
+    each = (np.asarray(b.weight)[:, b.lead :] for b in bench.blocks)
+    return [w[w > 0] for w in each]
 
 
 def _from(found: Refit, bench: Bench) -> dict[str, Any]:
@@ -292,18 +310,58 @@ def _from(found: Refit, bench: Bench) -> dict[str, Any]:
 
 
 def _values(
-    rough: list[tuple[Candidate, Refit]], done: Mapping[int, Refit], bench: Bench, ratio: float
+    rough: list[tuple[Candidate, Refit]], done: Mapping[int, _Whole], bench: Bench, part: Bench
 ) -> list[float]:
-    """Evidence of thorough fits; of the others what their rough ones lack to the best of those."""
+    """Densities of thorough fits; of the others what their rough ones lack to the best of those."""
     if not rough:
         return []
-    own = {i: _value(r, bench) for i, r in done.items()}
+    own = {i: _density(*x) for i, x in done.items()}
     best = max(own, key=lambda i: own[i], default=0)
-    top, level = _value(rough[best][1], bench), own.get(best, 0.0)
-    if not math.isfinite(level):
+    top, level, gain = _value(rough[best][1], bench), own.get(best, 0.0), 0.0
+    if math.isfinite(level) and best in done:
+        gain = 2 * (_gauge(done[best].bench) - _gauge(bench))
+    else:
         top, level = max(_value(r, bench) for _, r in rough), 0.0
+    ratio = _ratio(bench, part) * math.exp(gain)
     every = (own.get(i, level - ratio * (top - _value(r, bench))) for i, (_, r) in enumerate(rough))
     return [x if math.isfinite(x) else -math.inf for x in every]
+
+
+def _finished(
+    rough: list[tuple[Candidate, Refit]],
+    done: Mapping[int, _Whole],
+    bench: Bench,
+    part: Bench,
+    thoroughly: Callable[[int], None],
+) -> list[float]:
+    """Densities of all, the first of which is that of a thorough fit."""
+    while (values := _values(rough, done, bench, part)) and (i := int(np.argmax(values))) not in done:
+        if not math.isfinite(values[i]):
+            break
+        thoroughly(i)
+    return values
+
+
+def _compared(
+    rough: list[tuple[Candidate, Refit]],
+    values: list[float],
+    done: Mapping[int, _Whole],
+    bench: Bench,
+    without: Refit,
+    effort: Effort,
+) -> Ranking:
+    """The round, in the noise that the best one leaves."""
+    if not rough:
+        return _ranked([], without, bench, effort.temperature)
+    at = done.get(int(np.argmax(values)), _Whole(bench, rough[0][1]))
+    without = refitted(at.bench, without.hypothesis, **_from(without, bench))
+    shift, gauge = _density(*at) - at.refit.fit.evidence, _gauge(at.bench)
+    every = []
+    for i, ((c, r), value) in enumerate(zip(rough, values, strict=True)):
+        own = done.get(i, _Whole(bench, r))
+        mean = own.refit.fit.squares / max(own.refit.fit.equations, 1)
+        every.append((c, own.refit, value - shift, math.sqrt(mean) * math.exp(gauge - _gauge(own.bench))))
+    return _ranked(every, without, at.bench, effort.temperature)
 
 
 def _value(found: Refit, bench: Bench) -> float:
@@ -331,18 +389,18 @@ def _sensible(found: Refit, bench: Bench) -> bool:
 
 
 def _ranked(
-    every: list[tuple[Candidate, Refit, float]], without: Refit, bench: Bench, temperature: float
+    every: list[tuple[Candidate, Refit, float, float]], without: Refit, bench: Bench, temperature: float
 ) -> Ranking:
     every = sorted(every, key=lambda x: -x[2])
     first = every[0][1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
-    values = np.array([e for _, _, e in every] + [without.fit.evidence]) / scale / temperature
+    values = np.array([x[2] for x in every] + [without.fit.evidence]) / scale / temperature
     weights = np.exp(values - values.max())
     weights = weights / weights.sum()
     return Ranking(
         tuple(
-            Explanation(c.kind, dict(c.place), r, e, float(w))
-            for (c, r, e), w in zip(every, weights[:-1], strict=True)
+            Explanation(c.kind, dict(c.place), r, e, float(w), left)
+            for (c, r, e, left), w in zip(every, weights[:-1], strict=True)
         ),
         without,
         scale,

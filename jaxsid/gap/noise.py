@@ -22,7 +22,6 @@ SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, t
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
-COLOUR = 2.0  # rms of coloured noise next to its level in the quietest band, at most
 FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
 
@@ -207,22 +206,6 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     """
     noise = _fitted(signals if signals.ndim == 3 else signals[None], SOURCES[3])
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
-
-
-def believable(guess: Noise, left: Noise) -> Noise:
-    """What a fit leaves of each sensor where that can be noise, else the guess of the quietest band.
-
-    Args:
-        guess: from `floor`, which colour can put too low, but not by much.
-        left: from `residual_noise`, which may hold more than noise, but no less.
-    """
-    no_more = ~(left.rms() > COLOUR * guess.rms())
-    return Noise(
-        np.where(no_more, left.level, guess.level),
-        np.where(no_more[:, None], left.taps, guess.taps),
-        0.0,
-        guess.source,
-    )
 
 
 def floor(spectra: Spectra) -> Noise:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxsid.gap.fit import GAIN, STEPS, Fit, Prior, fitted
 from jaxsid.gap.hypothesis import (
@@ -20,7 +20,7 @@ from jaxsid.gap.hypothesis import (
     shifts_of,
     with_parameters,
 )
-from jaxsid.gap.noise import Noise, believable, residual_noise
+from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
@@ -72,7 +72,7 @@ class Bench(NamedTuple):
     records: int
     substeps: int
     noises: tuple[Noise, ...]
-    guesses: tuple[Noise, ...] = ()
+    guesses: tuple[Noise, ...]
     jump: float = np.inf
 
     def state_deviations(self, slots: int) -> Float[np.ndarray, " m"]:
@@ -186,34 +186,50 @@ def _substeps(model: LumpedModel, dt: float) -> int:
     return int(np.clip(np.ceil(STEPS_A_PERIOD * quickest * dt / (2 * np.pi)), 1, MOST_SUBSTEPS))
 
 
-def weighed_anew(bench: Bench, found: Refit, *, noise: bool) -> Bench:
+def weighed_anew(bench: Bench, found: Refit) -> Bench:
     """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
 
     Args:
         bench: records.
         found: a fit to all of it.
-        noise: whether what it leaves is nothing else; else it is taken for noise only where it is little more than
-            the guess.
     """
     lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
-    noises, blocks = list(bench.noises), list(bench.blocks)
-    for number, old in enumerate(bench.noises):
-        own = [i for i, b in enumerate(blocks) if int(b.record[0]) == number]
-        seen = np.concatenate([np.asarray(blocks[i].weight)[:, blocks[i].lead :] > 0 for i in own])
-        left = np.concatenate([lefts[i][:, blocks[i].lead :] for i in own])
+    noises = list(bench.noises)
+    for number, noise in enumerate(bench.noises):
+        own = [i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number]
+        seen = np.concatenate([_seen(bench.blocks[i]) for i in own])
+        left = np.concatenate([lefts[i][:, bench.blocks[i].lead :] for i in own])
         whole = np.all(seen.any(axis=2), -1)
-        if old.degrees > 0 or whole.sum() == 0:
-            continue
-        new = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
-        noises[number] = new if noise else believable(bench.guesses[number], new)
-        level = noises[number].level
-        inverse = jnp.asarray(
-            np.where(np.isfinite(level) & (level > 0), 1 / np.where(level > 0, level, 1.0), 0.0)
-        )
-        for i in own:
-            b = blocks[i]
-            taps = jnp.broadcast_to(jnp.asarray(noises[number].taps), b.taps.shape)
-            blocks[i] = eqx.tree_at(lambda x: (x.weight, x.taps), b, ((b.weight > 0) * inverse, taps))
+        if noise.degrees <= 0 and whole.sum() > 0:
+            noises[number] = residual_noise(np.where(seen.any(axis=(0, 1)), left, np.nan)[whole])
+    return _weighed(bench, noises)
+
+
+def as_guessed(bench: Bench) -> Bench:
+    """The bench with the noise as it was guessed to begin with, where nothing else tells of it, and windows apart.
+
+    What a fit leaves may be more than noise; a search that begins there does not find what that is.
+
+    Args:
+        bench: records.
+    """
+    if all(n.degrees > 0 for n in bench.noises):
+        return bench
+    return _weighed(bench, bench.guesses)._replace(jump=np.inf)
+
+
+def _seen(block: Block) -> Bool[np.ndarray, "windows length outputs"]:
+    return np.asarray(block.weight)[:, block.lead :] > 0
+
+
+def _weighed(bench: Bench, noises: Sequence[Noise]) -> Bench:
+    blocks = []
+    for b in bench.blocks:
+        noise = noises[int(b.record[0])]
+        known = np.isfinite(noise.level) & (noise.level > 0)
+        inverse = jnp.asarray(np.where(known, 1 / np.where(known, noise.level, 1.0), 0.0))
+        taps = jnp.broadcast_to(jnp.asarray(noise.taps), (*b.taps.shape[:2], noise.taps.shape[1]))
+        blocks.append(eqx.tree_at(lambda x: (x.weight, x.taps), b, ((b.weight > 0) * inverse, taps)))
     return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
 
 
