@@ -302,8 +302,7 @@ def _turn(at: _Found, i: int, model: LumpedModel, say: Callable[[str], None]) ->
         rounds[i] = ranking
         selected[i] = x._replace(probability=ranking.ranked[0].probability)
         return at._replace(rounds=tuple(rounds), selected=tuple(selected)), False
-    other = _in_place(at, i, ranking)
-    return (at, False) if other is None else (other, True)
+    return _in_place(at, i, ranking), True
 
 
 def _without(at: _Found, x: Explanation, model: LumpedModel) -> tuple[Refit, tuple[np.ndarray, ...]]:
@@ -318,14 +317,10 @@ def _without(at: _Found, x: Explanation, model: LumpedModel) -> tuple[Refit, tup
     return refitted(at.bench, Hypothesis(effects, wrong), **start), states
 
 
-def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found | None:
-    """With the best of a round in the place of the effect that was found i-th; None where that is no better."""
-    assert at.before is not None
+def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found:
+    """With the best of a round in the place of the effect that was found i-th."""
     new = _Found(ranking.bench, at.look, (), (), None).taken(ranking)
     assert new.before is not None
-    old = refitted(new.bench, at.before.hypothesis, changes=changes_of(at.before, new.bench), steps=POLISHED)
-    if old.fit.evidence >= new.before.fit.evidence:
-        return None
     rounds, selected = list(at.rounds), list(at.selected)
     rounds[i], selected[i] = ranking, new.selected[0]
     hypothesis, errors = Hypothesis(), elements_by_key(new.bench.model)

@@ -289,7 +289,12 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
 
 def _density(bench: Bench, found: Refit) -> float:
     """Evidence as a density of the records, whatever the noise: log p(y) up to a constant."""
-    return _value(found, bench) + sum(float(np.log(w).sum()) for w in _weights(bench))
+    return _value(found, bench) + _volume(bench)
+
+
+def _volume(bench: Bench) -> float:
+    """Logarithm of how densely values in units of the noise lie next to values in those of the sensors."""
+    return sum(float(np.log(w).sum()) for w in _weights(bench))
 
 
 def _gauge(bench: Bench) -> float:
@@ -355,12 +360,12 @@ def _compared(
         return _ranked([], without, bench, effort.temperature)
     at = done.get(int(np.argmax(values)), _Whole(bench, rough[0][1]))
     without = refitted(at.bench, without.hypothesis, **_from(without, bench))
-    shift, gauge = _density(*at) - at.refit.fit.evidence, _gauge(at.bench)
+    volume, gauge = _volume(at.bench), _gauge(at.bench)
     every = []
     for i, ((c, r), value) in enumerate(zip(rough, values, strict=True)):
         own = done.get(i, _Whole(bench, r))
         mean = own.refit.fit.squares / max(own.refit.fit.equations, 1)
-        every.append((c, own.refit, value - shift, math.sqrt(mean) * math.exp(gauge - _gauge(own.bench))))
+        every.append((c, own.refit, value - volume, math.sqrt(mean) * math.exp(gauge - _gauge(own.bench))))
     return _ranked(every, without, at.bench, effort.temperature)
 
 
