@@ -163,7 +163,7 @@ def test_a_worker_without_the_library_is_told(tmp_path, tmp_path_factory):
     machines = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
         machines.add_worker(PYTHONPATH=f"{blocked}:{Path(__file__).parent}")
-        with remote_workers(machines.address) as execute, pytest.raises(InputError, match=r"jaxsid\[study\]"):
+        with remote_workers(machines.address) as execute, pytest.raises(InputError, match=r"\.\[study\]"):
             run(PLAN, tmp_path, execute=execute)
     finally:
         machines.stop()
