@@ -277,10 +277,11 @@ def _reconsidered(
     for _ in range(MOST_TURNS):
         if not due:
             break
-        i = [x.key for x in at.selected].index(due.pop(0))
-        at, changed = _turn(at, i, model, say)
+        asked, keys = due.pop(0), {x.key for x in at.selected}
+        at, changed = _turn(at, [x.key for x in at.selected].index(asked), model, say)
         if changed:
-            due = [x.key for j, x in enumerate(at.selected) if j != i] if len(at.selected) > 1 else []
+            # what has just come in has been compared; one alone has nothing beside it
+            due = [x.key for x in at.selected if x.key in keys] if len(at.selected) > 1 else []
     same = [x.key for x in before] == [x.key for x in at.selected]
     return at if same else at._replace(look=_looked(model, seen, at))
 

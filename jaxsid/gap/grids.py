@@ -176,8 +176,8 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
         hertz: frequencies to try, for parameters in Hz.
     """
     kind, plan = CATALOGUE[name], plan_of(name)
-    counts = COUNTS.get(len(plan.shape), (3,) + (2,) * (len(plan.shape) - 1))
-    counts = RESONANCES if plan.whole else counts
+    several = COUNTS.get(len(plan.shape), (3,) + (2,) * (len(plan.shape) - 1))
+    counts = RESONANCES if plan.whole else several
     axes = [
         hertz if i == plan.frequency else quantiles(kind.parameters[i].prior, count)
         for i, count in zip(plan.shape, counts, strict=True)

@@ -129,7 +129,7 @@ def remaining(found: Found) -> str:
     causes, gap = found.causes, found.examination.recalibrated
     if causes is None or found.verdict == "none":
         return f"The linear model, its numbers refitted, leaves {gap.total:.3g} times the noise."
-    if causes.places is None:
+    if causes.places is None and found.verdict != "unknown":
         return "What remains: nothing significant."
     names = [s.name for s in found.nominal.sensors]
     closure = causes.closures[-1]

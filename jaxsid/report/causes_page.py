@@ -261,7 +261,7 @@ def _mean(y: np.ndarray) -> np.ndarray:
 
 
 def remaining_section(found: Diagnosis) -> Section:
-    """What tests find in what is left, and effects that were tried and refused.
+    """What tests find in what is left, and effects that were tried and refused or that only come near.
 
     Args:
         found: a diagnosis.
@@ -272,15 +272,18 @@ def remaining_section(found: Diagnosis) -> Section:
     told = found.remaining.removeprefix("What remains: ")
     blocks: list[Block] = [Text(told[0].upper() + told[1:])]
     further = causes.rounds[len(causes.selected) :]
-    if causes.selected and further and further[0].ranked:
-        refused = further[0].ranked[0]
-        blocks.append(
-            Text(
-                f"A further effect was tried: the most probable, {named(refused)}, would explain too little of what is "
-                "left to be claimed."
-            )
+    unknown = found.verdict == "unknown"
+    if (causes.selected or unknown) and further and further[0].ranked:
+        next_one = named(further[0].ranked[0])
+        said = (
+            f"The law of the catalogue that comes nearest to it, {next_one}, does not explain it."
+            if unknown
+            else f"A further effect was tried: the most probable, {next_one}, would explain too little of what is left "
+            "to be claimed."
         )
-    if causes.selected:
+        blocks.append(Text(said))
+    # beside what is unknown, tests were of what its stand-in leaves
+    if causes.selected and not unknown:
         tests = sorted(causes.remaining.tests, key=lambda x: x.p_value)[:TESTS]
         rows = tuple((x.name, chance(x.p_value), percent(x.share)) for x in tests)
         note = (
