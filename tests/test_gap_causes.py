@@ -182,15 +182,17 @@ def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
 
 
 def test_a_further_effect_must_be_worth_it():
-    def worth(gain, less, before=3000.0):
-        best, without = refit(gain, before - less), refit(0.0, before)
+    def worth(gain, before, equations=1000):
+        best, without = refit(gain, equations, equations), refit(0.0, before, equations)
         one = Explanation("backlash", B12, best, gain, 1.0, 1.0)
         return _worth(Ranking((one,), without, 1.0, TEMPERATURE, BENCH))
 
-    assert worth(1.01 * WORTH * TEMPERATURE, 210.0)
-    assert not worth(0.99 * WORTH * TEMPERATURE, 210.0)
-    assert not worth(1e4, 190.0)  # of the 2000 above the noise less than a tenth
-    assert not worth(1e4, 9.0, before=1000.0)  # there is nothing but noise, of which less than 1 %
+    assert worth(1.01 * WORTH * TEMPERATURE, 1500.0)
+    assert not worth(0.99 * WORTH * TEMPERATURE, 1500.0)
+    assert worth(101.0, 3000.0)
+    assert not worth(99.0, 3000.0)  # of the 2000 above the noise less than a tenth
+    assert worth(51.0, 1e4, equations=10000)
+    assert not worth(49.0, 1e4, equations=10000)  # there is nothing but noise, of which less than 1 %
     assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
     assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
 
@@ -243,6 +245,7 @@ def two(monkeypatch):
     monkeypatch.setattr(module, "states_without", lambda found, row: ())
     monkeypatch.setattr(module, "changes_of", lambda found, bench: None)
     monkeypatch.setattr(module, "_looked", lambda *_: "looked again")
+    monkeypatch.setattr(module, "_candidates", lambda look: (candidate("coulomb_friction", B23, force=1.0),))
     monkeypatch.setattr(module, "tied", lambda bench, found, **_: (bench, found))
     monkeypatch.setattr(module, "weighed_anew", lambda bench, found, **_: bench)
 
@@ -254,18 +257,20 @@ def two(monkeypatch):
         def fitted(bench, hypothesis, **_):
             kinds = [e.kind for e in hypothesis.effects]
             first = next((k for k in kinds if k != "hysteresis"), None)
-            return refit(value[first] if "hysteresis" in kinds else -500.0, hypothesis=hypothesis)
+            here = value.get(first, -1e4) if "hysteresis" in kinds else -500.0
+            return refit(here, hypothesis=hypothesis)
 
         def rank_again(bench, found, x, others, without, effort, say):
             asked.append([y.kind for y in (x, *others)])
-            candidates = [again(y, y.refit) for y in (x, *others)]
+            candidates = [again(x, x.refit), *others]
             every = [(c, fitted(bench, extended(without.hypothesis, c, {}))) for c in candidates]
             return _ranked([(c, r, r.fit.evidence, 1.0) for c, r in every], without, BENCH, TEMPERATURE)
 
         monkeypatch.setattr(module, "refitted", fitted)
         monkeypatch.setattr(module, "rank_again", rank_again)
         found = _reconsidered(at, chain(), (), lambda text: None)
-        assert asked[0] == ["cubic_stiffness", "backlash"]
+        # what was next to it, and what comes first beside the other
+        assert asked[0] == ["cubic_stiffness", "backlash", "coulomb_friction"]
         return found, asked
 
     return set_up
@@ -287,8 +292,8 @@ def test_another_effect_takes_its_place(two):
     assert [len(x.refit.hypothesis.effects) for x in found.selected] == [1, 2]
     assert found.before is found.selected[-1].refit
     assert found.look == "looked again"
-    # then the later one is asked again beside it
-    assert asked[1:] == [["hysteresis"]]
+    # then the later one is asked again beside it, next to what comes first and other laws of its place
+    assert asked[1:] == [["hysteresis", "coulomb_friction", "coulomb_friction"]]
 
 
 def test_an_effect_that_a_later_one_makes_needless_is_left_out(two):

@@ -59,6 +59,8 @@ PLACES = 4  # of one kind that are tried before other kinds, where something was
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.01  # and of all that is left
 MOST_TURNS = 5  # of asking again
+AGAIN = 6  # others that an effect is compared with when it is asked again, of each sort
+FAR = 4.0  # times what an effect left when it was found, that others which left more are not asked again
 
 
 class Causes(NamedTuple):
@@ -215,7 +217,7 @@ class _Found(NamedTuple):
 
 
 def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
-    """Effects one after another, and of those the ones that are needed still."""
+    """Effects one after another, those found before asked again after each."""
     assert at.look.scored is not None
     # on a free axis lines do not show what is steady, and little is right without it
     steady = unseen(at.bench.model, at.look.scored.places)
@@ -223,18 +225,25 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     at = with_steady if with_steady.selected else at
     begun = len(at.selected)
     most, first = MOST_EFFECTS + begun, _candidates(at.look)
-    candidates, before = first, begun - 1
-    while before < len(at.selected) < most and candidates:
-        before = len(at.selected)
-        at = _further(at, candidates, FURTHER if before > begun else FIRST, model, seen, say)
-        if steady and before == begun == 0 < len(at.selected):
+    candidates = first
+    for effort in (FIRST, *[FURTHER] * MOST_EFFECTS):
+        known = len(at.selected)
+        if known >= most or not candidates:
+            break
+        at = _further(at, candidates, effort, model, seen, say)
+        if len(at.selected) == known:
+            break
+        if steady and known == 0:
             # beside what was far larger it was not worth it
             at = _further(at, steady, FURTHER, model, seen, say)
             most += len(at.selected) - 1
+        at = _reconsidered(at, model, seen, say)
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
-        candidates = tuple(c for pair in zip(now, _varied(first), strict=False) for c in pair)
-    return _reconsidered(at, model, seen, say)
+        candidates = tuple(
+            c for three in zip(now[::2], now[1::2], _varied(first), strict=False) for c in three
+        )
+    return at
 
 
 def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -278,7 +287,7 @@ def _reconsidered(
         if not due:
             break
         asked, keys = due.pop(0), {x.key for x in at.selected}
-        at, changed = _turn(at, [x.key for x in at.selected].index(asked), model, say)
+        at, changed = _turn(at, [x.key for x in at.selected].index(asked), model, seen, say)
         if changed:
             # what has just come in has been compared; one alone has nothing beside it
             due = [x.key for x in at.selected if x.key in keys] if len(at.selected) > 1 else []
@@ -286,13 +295,19 @@ def _reconsidered(
     return at if same else at._replace(look=_looked(model, seen, at))
 
 
-def _turn(at: _Found, i: int, model: LumpedModel, say: Callable[[str], None]) -> tuple[_Found, bool]:
+def _turn(
+    at: _Found, i: int, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]
+) -> tuple[_Found, bool]:
     """One effect asked again beside all others, and whether that changes anything."""
     x = at.selected[i]
     say(f"{x.kind} beside the others")
     without, states = _without(at, x, model)
     assert at.before is not None
-    others = [y for y in at.rounds[i].ranked if y.key != x.key]
+    # what came next to it once, what comes first beside the others, and other laws of the place
+    once = [again(y, y.refit) for y in at.rounds[i].ranked if y.key != x.key and y.left < FAR * x.left]
+    now = _candidates(_looked(model, seen, at._replace(before=without)))
+    here = [c for c in now if key_of(x.kind, c.place) == x.key]
+    others = [*once[:AGAIN], *_varied(now)[:AGAIN], *here[:AGAIN]]
     ranking = rank_again(at.bench._replace(states=states), at.before, x, others, without, FURTHER, say)
     rounds, selected = list(at.rounds), list(at.selected)
     if ranking.gain <= WORTH:
@@ -349,7 +364,7 @@ def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         at = at.taken(ranking)
     if begun and len(at.selected) > begun:
         say("what is left")
-        at = at._replace(look=_looked(model, seen, at))
+        at = _reconsidered(at._replace(look=_looked(model, seen, at)), model, seen, say)
     return at
 
 
@@ -381,7 +396,8 @@ def _worth(ranking: Ranking) -> bool:
     """Whether the best further candidate explains much of what was left."""
     best, without = ranking.ranked[0], ranking.without.fit
     above = without.squares - without.equations
-    less = without.squares - best.refit.fit.squares
+    # of windows that lead to one another what is missed shows where they meet, too
+    less = 2 * (best.evidence - without.evidence)
     return ranking.gain > WORTH and less > max(LESS * above, LEAST * without.squares)
 
 
@@ -422,7 +438,7 @@ def _looked(model: LumpedModel, seen: Sequence[Record], at: _Found) -> _Look:
     wrong = list(before.hypothesis.wrong)
     change[wrong] = before.fit.theta[wrong]
     base = with_values(bench.model, jnp.asarray(nominal * (1 + change)))
-    records = [deflated(r, i, bench, before) for i, r in enumerate(seen)]
+    records = deflated(seen, bench, before)
     fit = recalibrated(base, records, bench.noises, wide=True, given=True)
     look = _Look(fit, null_test(fit, places_of(base)), None)
     return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))

@@ -1,97 +1,107 @@
 """Records without what effects that were found do to them, so that what is left can be looked at as if they were not.
 
-What effects do is the difference of two free runs, with and without them. On a free axis a law's run leaves what was
-measured without bounds. There its force is taken from the windows that it was fitted in, sample by sample; with these
-forces given all the rest is linear.
+Given the motion, forces of effects are forces like any other, and all the rest is linear: x+ = A x + e from window to
+window, e what the effects did on the way. Their share of the motion builds up as c+ = A c + e, and what they do to
+readings is how a window that begins at x differs from one of the linear model that begins at x - c. So laws act at
+every step of a simulation, not only where there are samples.
+
+Windows of a fit that lead to one another follow what was measured, so that no small error leads astray. Windows that
+stand alone know their motion from a few samples each; a free run knows it better, unless it drifts away.
 """
+
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxsid.gap.free_run import free_run
 from jaxsid.gap.measure import is_free_or_unstable
-from jaxsid.gap.refit import Bench, Refit, in_windows, shot_of
-from jaxsid.gap.shooting import Shot
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
+from jaxsid.gap.refit import Bench, Refit, shot_of
+from jaxsid.gap.shooting import Products, Shot, products_of
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.records import Record
 
 
-def deflated(record: Record, number: int, bench: Bench, found: Refit) -> Record:
-    """A record less what effects do to it.
+def deflated(records: Sequence[Record], bench: Bench, found: Refit) -> list[Record]:
+    """Records less what effects do to them.
 
     Args:
-        record: that the effects were fitted to.
-        number: of it.
-        bench: of all records.
+        records: that the effects were fitted to.
+        bench: of them.
         found: the fit.
     """
-    effects = found.hypothesis.effects
-    if not effects:
-        return record
-    leaves = is_free_or_unstable(bench.model)
-    laws = [i for i, e in enumerate(effects) if leaves and sort_of(CATALOGUE[e.kind]) != "linear"]
-    kept = [i for i in range(len(effects)) if i not in laws]
-    first = next(i for i, b in enumerate(bench.blocks) if int(b.record[0]) == number)
-    block, begin = bench.blocks[first], int(bench.blocks[first].first[0])
-    u = np.asarray(ordered_inputs(bench.model, record)[0])
-    given = {"record": number, "first": begin, "substeps": bench.substeps}
+    if not found.hypothesis.effects:
+        return list(records)
+    size = 2 * len(bench.model.bodies)
+    plain, theta = _linear(found, bench)
+    own = ((0, 0), (0, 2 * plain.slots.count))
+    begun = found.fit.states if _followed(bench) else _run(records, bench, found)
+    within = products_of(found.shot, bench.blocks, found.fit.theta, begun, bench.substeps)
+    states = [np.pad(s[:, :size], own) for s in begun]
+    shares = _shares(bench, within, products_of(plain, bench.blocks, theta, states, 1), size)
+    rest = [s - np.pad(c, own) for s, c in zip(states, shares, strict=True)]
+    without = products_of(plain, bench.blocks, theta, rest, 1)
+    changes = [np.asarray(x.left) - np.asarray(y.left) for x, y in zip(within, without, strict=True)]
+    return [_less(record, i, bench, changes) for i, record in enumerate(records)]
 
-    def run(shot: Shot, theta: np.ndarray, inputs: np.ndarray, ramps: Array, state: np.ndarray) -> np.ndarray:
-        return free_run(shot, theta, inputs, ramps, float(record.dt), state, **given).outputs[-begin:]
 
-    size, state = 2 * len(bench.model.bodies), found.fit.states[first][0]
-    hidden = state[size:].reshape(2, len(effects))[:, kept].ravel()
+def _followed(bench: Bench) -> bool:
+    """Whether the windows are a better motion than a free run."""
+    return bool(np.isfinite(bench.jump)) or is_free_or_unstable(bench.model)
 
-    def padded(shot: Shot, *parts: np.ndarray) -> np.ndarray:
-        joined = np.concatenate(parts)
-        return np.pad(joined, (0, size + 2 * shot.slots.count - len(joined)))
 
-    plain, rest = _part(found, bench, [])
-    without = run(plain, rest, u, block.ramps, padded(plain, state[:size]))
-    shot, theta = _part(found, bench, kept)
-    begun = padded(shot, state[:size], hidden)
-    if laws:
-        shot = _driven(shot, np.asarray(found.shot.slots.pushes)[laws])
-        u = np.concatenate([u, _forces(number, bench, found)[: len(u), laws]], axis=1)
-    ramps = jnp.concatenate([block.ramps, jnp.ones(len(laws), bool)])
-    change = run(shot, theta, u, ramps, begun) - without
+def _run(records: Sequence[Record], bench: Bench, found: Refit) -> list[Float[np.ndarray, "windows n"]]:
+    """States at the start of every window, of runs from the first window of each record."""
+    states = []
+    for number, record in enumerate(records):
+        own = [
+            (b, s) for b, s in zip(bench.blocks, found.fit.states, strict=True) if int(b.record[0]) == number
+        ]
+        (block, begun), u = own[0], np.asarray(ordered_inputs(bench.model, record)[0])
+        first = int(block.first[0])
+        given = {"record": number, "first": first, "substeps": bench.substeps}
+        run = free_run(found.shot, found.fit.theta, u, block.ramps, float(record.dt), begun[0], **given)
+        states += [run.states[np.clip(np.asarray(b.first) - first, 0, len(run.states) - 1)] for b, _ in own]
+    return states
+
+
+def _linear(found: Refit, bench: Bench) -> tuple[Shot, Float[np.ndarray, " p"]]:
+    """The fit's model without effects, and its unknowns."""
+    shot = shot_of(bench, ())
+    elements = len(bench.tolerance)
+    rest = shot.coordinates.centre.size + (bench.records - 1) * shot.slots.count
+    return shot, np.pad(np.asarray(found.fit.theta)[:elements], (0, rest))
+
+
+def _shares(
+    bench: Bench, within: Sequence[Products], linear: Sequence[Products], size: int
+) -> list[Float[np.ndarray, "windows n"]]:
+    """The effects' share of the motion at the start of every window; none where a record begins."""
+    shares, share, number = [], np.zeros(size), -1
+    for block, x, y in zip(bench.blocks, within, linear, strict=True):
+        if int(block.record[0]) != number:
+            share, number = np.zeros(size), int(block.record[0])
+        did = np.asarray(x.ends)[:, :size, 0] - np.asarray(y.ends)[:, :size, 0]
+        # slopes by the initial state come last
+        carried = np.asarray(y.ends)[:, :size, -np.asarray(y.ends).shape[1] :][:, :, :size]
+        own = []
+        for forced, free in zip(did, carried, strict=True):
+            own.append(share)
+            share = free @ share + forced
+        shares.append(np.stack(own))
+    return shares
+
+
+def _less(record: Record, number: int, bench: Bench, changes: Sequence[np.ndarray]) -> Record:
+    """A record less the changes of its windows, side by side."""
+    parts = [
+        x[:, b.lead :].reshape(-1, x.shape[2])
+        for b, x in zip(bench.blocks, changes, strict=True)
+        if int(b.record[0]) == number
+    ]
+    change = np.concatenate(parts)[: len(record.y)]
     names = [s.name for s in bench.model.sensors]
     columns = [change[:, names.index(n)] if n in names else 0.0 * change[:, 0] for n in record.outputs]
     return eqx.tree_at(lambda r: r.y, record, jnp.asarray(np.asarray(record.y) - np.stack(columns, axis=1)))
-
-
-def _forces(number: int, bench: Bench, found: Refit) -> Float[np.ndarray, "samples slots"]:
-    """Of every effect along a record."""
-    blocks = [
-        (b, x)
-        for b, x in zip(bench.blocks, in_windows(bench, found), strict=True)
-        if int(b.record[0]) == number
-    ]
-    return np.concatenate(
-        [np.asarray(x.forces)[:, b.lead :].reshape(-1, x.forces.shape[2]) for b, x in blocks]
-    )
-
-
-def _part(found: Refit, bench: Bench, kept: list[int]) -> tuple[Shot, np.ndarray]:
-    """The hypothesis with some of its effects only, and its unknowns."""
-    shot = shot_of(bench, tuple(found.hypothesis.effects[i] for i in kept))
-    elements, slots = len(bench.tolerance), len(found.shot.slots.parameters)
-    theta, rows = np.asarray(found.fit.theta), shot.slots.count
-    own, further = (
-        np.zeros((rows, found.shot.coordinates.centre.shape[1])),
-        np.zeros((bench.records - 1, rows)),
-    )
-    z = theta[elements : elements + found.shot.coordinates.centre.size].reshape(slots, -1)
-    shifts = theta[elements + z.size :].reshape(-1, slots)
-    own[: len(kept)], further[:, : len(kept)] = z[kept], shifts[:, kept]
-    return shot, np.concatenate([theta[:elements], own.ravel(), further.ravel()])
-
-
-def _driven(shot: Shot, pushes: Float[np.ndarray, "laws N"]) -> Shot:
-    """The same with forces of laws as further inputs."""
-    matrix = jnp.concatenate([shot.linear.input_matrix, jnp.asarray(pushes).T], axis=1)
-    inputs = jnp.pad(shot.slots.inputs, ((0, 0), (0, len(pushes))))
-    return eqx.tree_at(lambda s: (s.linear.input_matrix, s.slots.inputs), shot, (matrix, inputs))

@@ -33,6 +33,7 @@ TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
 MILD = 2.0  # of the model's numbers, whose equations are known
 ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
+LINKED = 60  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
@@ -50,7 +51,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(12, 3, 16, TEMPERATURE)
+FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(15, 3, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 
@@ -196,7 +197,7 @@ def rank_again(
     bench: Bench,
     found: Refit,
     x: Explanation,
-    others: Sequence[Explanation],
+    others: Sequence[Candidate],
     without: Refit,
     effort: Effort,
     progress: Callable[[str], None] | None = None,
@@ -207,7 +208,7 @@ def rank_again(
         bench: records; the states to begin with are those of the fit, without what is the effect's own.
         found: the fit with the effect.
         x: the effect.
-        others: explanations that were tried where it was found.
+        others: what may be there in its place.
         without: the fit without it.
         effort: how much is fitted.
         progress: called with a line of text before each fit.
@@ -215,7 +216,7 @@ def rank_again(
     say = progress or (lambda text: None)
     errors, begin = elements_by_key(bench.model), changes_of(found, bench)
     own = again(x, found)
-    candidates = [own, *_distinct([again(y, y.refit) for y in others], found.hypothesis, errors)]
+    candidates = [own, *_distinct(others, found.hypothesis, errors)]
     known, bench = _Whole(bench, found), as_guessed(bench)
     part = loudest(bench, without)
     every = [(c, extended(without.hypothesis, c, errors), begin) for c in candidates]
@@ -277,13 +278,13 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
 
     What drifts away with one law need not with another, nor is what one leaves the noise of another.
     """
-    search = {"steps": effort.steps, "gain": FINE}
+    search, linked = {"steps": effort.steps, "gain": FINE}, {"steps": LINKED, "gain": FINE}
     found = refitted(bench, hypothesis, **start, **search)
-    bench, found = tied(bench, found, **search)
+    bench, found = tied(bench, found, **linked)
     if any(n.degrees <= 0 for n in bench.noises) and math.isfinite(found.fit.evidence):
         bench = weighed_anew(bench, found)
         found = refitted(bench, found.hypothesis, **_from(found, bench), **search)
-        bench, found = tied(bench, found, **search)
+        bench, found = tied(bench, found, **linked)
     return _Whole(bench, found)
 
 

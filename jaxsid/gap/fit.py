@@ -19,6 +19,7 @@ GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
+IDLE = 4  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 
@@ -87,11 +88,11 @@ def fitted(
         states: likewise, of each block.
         substeps: steps for each sampling interval.
         steps: most evaluations.
-        gain: of the cost, in mean squares of what is left, below which a helpful step is the last.
+        gain: of the cost, in mean squares of what is left, that is not worth a step.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
     at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
-    damping, growth, settled, done = DAMPING, SLOWER, False, 1
+    damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
     while done < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, links, damping)
         new = np.maximum(at.theta + move, prior.least)
@@ -110,7 +111,10 @@ def fitted(
             # what has just failed with less damping would fail again
             at, damping = found, damping if growth > SLOWER else max(damping / 5, 1e-9)
             growth = SLOWER
-            if less < gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost):
+            little = gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost)
+            idle = idle + 1 if less < little else 0
+            # a step held back by its damping brings little even far from the end
+            if idle and (idle == IDLE or _expected(at, prior, links) < little):
                 settled = True
                 break
         else:
@@ -259,6 +263,14 @@ def _step(at: _At, prior: Prior, links: Links, damping: float) -> tuple[np.ndarr
     move = move / max(1.0, np.abs(move / prior.most).max())
     moves = -back[:, :, p] - np.einsum("wnp,p->wn", back[:, :, :p], move)
     return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
+
+
+def _expected(at: _At, prior: Prior, links: Links) -> float:
+    """How much less the cost would be at its lowest, were it a parabola."""
+    p = len(at.theta)
+    reduced, *_ = _normal(at, prior, links).reduced()
+    slope = reduced[:, p:]
+    return float(0.5 * slope[:, 0] @ _solved(reduced[:, :p], slope)[:, 0])
 
 
 def _led(at: _At, prior: Prior, links: Links) -> list[np.ndarray]:

@@ -16,6 +16,7 @@ from jaxsid.mechanics.lumped import GROUND
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
+MORE = 0.75  # likewise, where much more than noise is left
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
@@ -85,7 +86,8 @@ def _unexplained(causes: Causes) -> float:
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1.0
     gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
-    return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - ENOUGH) / (1 - ENOUGH))))
+    enough = MORE if _substantial(last.after, last.noise_floor) else ENOUGH
+    return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
 def _beside(causes: Causes) -> int:
