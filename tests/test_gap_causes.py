@@ -386,6 +386,14 @@ def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
     # what counts is the last closure
     two = causes(ranking(0.0, -500.0), ranking(0.0, -500.0), closures=[closure(0.2), closure(0.02)])
     assert verdict_of(examination(), two).name == "effect"
+    # where much more than noise is left, more must be gone
+    with_floor = lambda gap, floor: math.hypot(0.3 * gap, floor)  # noqa: E731
+    much, little = (
+        closure(with_floor(0.3, x), recalibrated=with_floor(1.0, x), floor=x) for x in (0.01, 0.1)
+    )
+    assert much.against_recalibrated == pytest.approx(little.against_recalibrated) == pytest.approx(0.7)
+    assert verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[much])).name == "unknown"
+    assert verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[little])).name == "effect"
     # where the best linear model leaves noise, what counts is the gap of the nominal one
     linear = closure(0.0101, recalibrated=0.0102)
     assert linear.against_recalibrated < 0.5

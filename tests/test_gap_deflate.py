@@ -6,6 +6,7 @@ from gap_bench import bench, colored
 from gap_helpers import DT, JOINT, drive, exact, record
 from gap_helpers import with_effect as truth
 
+from jaxsid.gap import deflate as module
 from jaxsid.gap.deflate import deflated
 from jaxsid.gap.refit import Hypothesis, refitted
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -28,10 +29,12 @@ CUBIC = effect("cubic_stiffness", ("b1", "b2"), coefficient=9e5)
 DELAY = effect("sensor_delay", "s1", delay=1.8 * DT)
 
 
+@pytest.mark.parametrize("followed", [False, True], ids=["in a run", "in windows"])
 @pytest.mark.parametrize(
     ("effects", "late_by"), [((CUBIC,), 0), ((DELAY,), 2), ((DELAY, CUBIC), 2)], ids=["law", "signal", "both"]
 )
-def test_what_effects_do_is_taken_out(effects, late_by):
+def test_what_effects_do_is_taken_out(effects, late_by, followed, monkeypatch):
+    monkeypatch.setattr(module, "_followed", lambda bench: followed)
     u = drive()
     plain = exact(u)
     law = CUBIC in effects

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from jaxsid import Record
 from jaxsid.gap.explain import _density
-from jaxsid.gap.fit import Fit
+from jaxsid.gap.fit import Fit, _evaluated, _expected, _step, links_of
 from jaxsid.gap.hypothesis import FIXED, coordinates_of, parameter_rows, shifts_of
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.refit import (
@@ -462,6 +462,28 @@ def test_coulomb_friction_is_recovered():
     )
     assert abs(pull(found, "force", 3.0)) < 3
     assert found.deviations[0]["force"] < 0.1
+
+
+def test_what_a_search_expects_is_what_a_full_step_brings():
+    """So that a step which its damping holds back does not end it."""
+    y, level = colored(exact(drive()), 2)
+    of, nothing = bench(y, level, wide=True), Hypothesis()
+    shot, links = shot_of(of, ()), links_of(())
+    prior, elements = _prior(of, nothing, shot), len(of.tolerance)
+    begin = np.pad(np.full(elements, 1e-3), (0, shot.coordinates.centre.size))
+    states = [np.pad(s, ((0, 0), (0, 2 * shot.slots.count))) for s in of.states]
+    given = shot, of.blocks, links, prior
+    at = _evaluated(*given, begin, states, 1)
+    costs = []
+    for damping in (1e-9, 1e3):
+        move, moves = _step(at, prior, links, damping)
+        new = _evaluated(*given, begin + move, [a + b for a, b in zip(states, moves, strict=True)], 1)
+        costs.append(new.cost)
+        assert _expected(new, prior, links) == pytest.approx(
+            new.cost - costs[0], rel=0.02, abs=1e-3 * at.cost
+        )
+    assert _expected(at, prior, links) == pytest.approx(at.cost - costs[0], rel=0.02)
+    assert at.cost > costs[1] > costs[0]
 
 
 def test_deviations_come_from_windows_where_more_than_noise_is_left():

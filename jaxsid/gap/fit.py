@@ -267,10 +267,11 @@ def _step(at: _At, prior: Prior, links: Links, damping: float) -> tuple[np.ndarr
 
 def _expected(at: _At, prior: Prior, links: Links) -> float:
     """How much less the cost would be at its lowest, were it a parabola."""
-    p = len(at.theta)
-    reduced, *_ = _normal(at, prior, links).reduced()
-    slope = reduced[:, p:]
-    return float(0.5 * slope[:, 0] @ _solved(reduced[:, :p], slope)[:, 0])
+    p, normal = len(at.theta), _normal(at, prior, links)
+    reduced, back, _ = normal.reduced()
+    slope = reduced[:, p]
+    of_states = (normal.slopes * back[:, :, p]).sum()
+    return float(0.5 * (slope @ _solved(reduced[:, :p], slope[:, None])[:, 0] + of_states))
 
 
 def _led(at: _At, prior: Prior, links: Links) -> list[np.ndarray]:
