@@ -65,7 +65,7 @@ def test_blocks_judge_every_sample_once(samples, begin):
         assert block.lead == lead
         assert block.y.shape[1:] == (lead + length, 3)
         assert block.u.shape[1:] == (2 * lead + length, 1)
-        assert len(block.y) * length in (1024, 4096)
+        assert len(block.y) * length in BLOCKS
         np.testing.assert_array_equal(block.taps[:, 1], np.tile([1.0, -POLE], (len(block.y), 1)))
         assert len(set(np.asarray(block.record).tolist())) == 1
         for w, (first, number) in enumerate(zip(block.first.tolist(), block.record.tolist(), strict=True)):

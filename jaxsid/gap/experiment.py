@@ -16,7 +16,7 @@ from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.refit import Bench, Refit, changes_of, refitted
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import slowest_rate
-from jaxsid.gap.windows import BLOCKS, blocks_of
+from jaxsid.gap.windows import blocks_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -24,6 +24,7 @@ from jaxsid.records import Record
 
 LEVELS = {"the same input at a third of its level": 1 / 3, "the same input at three times its level": 3.0}
 SLOWER = 4  # times
+LONGEST = 4096  # samples of an input
 STEPS = 12  # of a fit
 ABOVE = 1.5  # rate up to which a multisine reaches, over the fastest mode's
 EDGE = 0.4  # of the sampling rate, which it does not reach beyond
@@ -85,8 +86,8 @@ def experiment_between(
 
 
 def _menu(bench: Bench, record: Record) -> dict[str, Float[np.ndarray, "samples inputs"]]:
-    """Inputs by name, none longer than a block."""
-    dt, used = float(record.dt), np.asarray(ordered_inputs(bench.model, record)[0])[: BLOCKS[-1]]
+    """Inputs by name, none longer than need be."""
+    dt, used = float(record.dt), np.asarray(ordered_inputs(bench.model, record)[0])[:LONGEST]
     at = np.arange(len(used))
     found = {name: level * used for name, level in LEVELS.items()}
     slow = [np.interp(at / SLOWER, at, column) for column in used.T]

@@ -33,7 +33,8 @@ TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
 MILD = 2.0  # of the model's numbers, whose equations are known
 ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
-LINKED = 60  # most steps where each window leads to the next: the search goes along a curved valley
+HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
+LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
@@ -261,7 +262,7 @@ def _roughly(
     for few, more in LONGER:
         rough.sort(key=lambda x: -_value(x[1], part))
         for i, (c, r) in enumerate(rough[:few]):
-            if not r.fit.settled:
+            if not r.fit.settled and r.fit.squares < HOPELESS * rough[0][1].fit.squares:
                 rough[i] = c, refitted(part, r.hypothesis, **_from(r, part), steps=more, gain=FINE)
     return sorted(rough, key=lambda x: -_value(x[1], part))
 

@@ -19,7 +19,7 @@ GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
-IDLE = 4  # steps in a row that bring little, after which no more is expected
+IDLE = 2  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 

@@ -16,7 +16,7 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.simulate import measured_sensors, ordered_inputs
 from jaxsid.records import Record
 
-BLOCKS = 1024, 4096  # samples that a block judges: the shortest that a record fills, so that programs are few
+BLOCKS = 1024, 2048  # samples that a block judges: the shortest that a record fills, so that programs are few
 SHORTEST, LONGEST = 128, 2048  # samples that a window judges
 PERIODS = 4.0  # of the slowest vibration, in a window
 LEAD = 8  # part of a window, as its inverse, that comes before what it judges
