@@ -277,7 +277,7 @@ def _further(
 def _reconsidered(
     at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]
 ) -> _Found:
-    """Every effect but the last beside those found later: left out, or another of its round in its place.
+    """Every effect but the last beside those found later: left out, or another that explains more in its place.
 
     While a later effect was still to be found others may have come first for what they took of it. Where one has
     changed, those beside it are asked again.

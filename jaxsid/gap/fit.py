@@ -15,7 +15,7 @@ from jaxsid.gap.shooting import Shot, products_of
 from jaxsid.gap.windows import Block
 
 STEPS = 25  # of the search
-GAIN = 0.05  # of the cost, in mean squares of what is left: a helpful step that brings less ends it
+GAIN = 0.05  # of the cost, in mean squares of what is left: where no more is to be had the search ends
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
 MOST_DAMPING = 1e8
