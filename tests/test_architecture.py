@@ -17,6 +17,7 @@ PACKAGE = ROOT / "jaxsid"
 # Low to high; a module imports from its own layer or a lower one.
 LAYERS = (
     "compilation",
+    "parallel",
     "records",
     "checks",
     "least_squares",

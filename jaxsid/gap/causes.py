@@ -228,7 +228,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     candidates = first
     for effort in (FIRST, *[FURTHER] * MOST_EFFECTS):
         known = len(at.selected)
-        if known >= most or not candidates:
+        if not candidates:
             break
         at = _further(at, candidates, effort, model, seen, say)
         if len(at.selected) == known:
@@ -238,6 +238,8 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
             at = _further(at, steady, FURTHER, model, seen, say)
             most += len(at.selected) - 1
         at = _reconsidered(at, model, seen, say)
+        if len(at.selected) >= most:
+            break
         # what came next to the first effect, in turn with what now comes first
         now = _varied(_candidates(at.look))
         candidates = tuple(

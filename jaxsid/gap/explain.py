@@ -8,6 +8,7 @@ best one leaves.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from jaxsid.gap.refit import (
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
+from jaxsid.parallel import side_by_side
 from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
@@ -167,31 +169,15 @@ def rank(
         effort: how much is fitted.
         progress: called with a line of text before each fit.
     """
-    say = progress or (lambda text: None)
     errors = elements_by_key(bench.model)
     base = before.hypothesis if before is not None else Hypothesis()
     bench = as_guessed(bench)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
-    part = loudest(bench, without)
     every = [
         (c, extended(base, c, errors), _changes(before, bench, c.changes))
         for c in _distinct(candidates, base, errors)[: effort.tried]
     ]
-    rough = _roughly(part, every, say)
-    scale = min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
-    top = _value(rough[0][1], bench) if rough else 0.0
-    done: dict[int, _Whole] = {}
-
-    def thoroughly(i: int) -> None:
-        c, r = rough[i]
-        say(f"{c.kind} at {_label(c.place)}, thoroughly")
-        done[i] = _whole(bench, r.hypothesis, {"changes": changes_of(r, bench)}, effort)
-
-    for i, (_, r) in enumerate(rough[: effort.refined]):
-        if i == 0 or (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
-            thoroughly(i)
-    values = _finished(rough, done, bench, part, thoroughly)
-    return _compared(rough, values, done, bench, without, effort)
+    return _round(bench, every, without, effort, progress or (lambda text: None))
 
 
 def rank_again(
@@ -214,28 +200,12 @@ def rank_again(
         effort: how much is fitted.
         progress: called with a line of text before each fit.
     """
-    say = progress or (lambda text: None)
     errors, begin = elements_by_key(bench.model), changes_of(found, bench)
     own = again(x, found)
     candidates = [own, *_distinct(others, found.hypothesis, errors)]
-    known, bench = _Whole(bench, found), as_guessed(bench)
-    part = loudest(bench, without)
     every = [(c, extended(without.hypothesis, c, errors), begin) for c in candidates]
-    rough = _roughly(part, every, say)
-    scale = found.fit.squares / max(found.fit.equations, 1)
-    first = next(i for i, (c, _) in enumerate(rough) if c is own)
-    top, done = _value(rough[first][1], bench), {first: known}
-
-    def thoroughly(i: int) -> None:
-        c, r = rough[i]
-        say(f"{c.kind} at {_label(c.place)}, thoroughly")
-        done[i] = _whole(bench, r.hypothesis, {"changes": begin}, effort)
-
-    for i, (_, r) in enumerate(rough[: effort.refined + 1]):
-        if i != first and (top - _value(r, bench)) / scale / effort.temperature < CLOSE:
-            thoroughly(i)
-    values = _finished(rough, done, bench, part, thoroughly)
-    return _compared(rough, values, done, bench, without, effort)
+    known = _Known(own, _Whole(bench, found), begin)
+    return _round(as_guessed(bench), every, without, effort, progress or (lambda text: None), known)
 
 
 def again(x: Explanation, found: Refit) -> Candidate:
@@ -250,28 +220,80 @@ def again(x: Explanation, found: Refit) -> Candidate:
     return Candidate(x.kind, x.place, parameters, np.zeros(0), x.evidence, math.nan, "", {})
 
 
-def _roughly(
-    part: Bench, every: Sequence[tuple[Candidate, Hypothesis, Any]], say: Callable[[str], None]
-) -> list[tuple[Candidate, Refit]]:
-    """Candidates fitted to a part of the records, best first: some steps for each, more for the best."""
-    rough = []
-    for c, hypothesis, changes in every:
-        say(f"{c.kind} at {_label(c.place)}")
-        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
-        rough.append((c, refitted(part, hypothesis, changes=changes, steps=steps, gain=FINE)))
-    for few, more in LONGER:
-        rough.sort(key=lambda x: -_value(x[1], part))
-        for i, (c, r) in enumerate(rough[:few]):
-            if not r.fit.settled and r.fit.squares < HOPELESS * rough[0][1].fit.squares:
-                rough[i] = c, refitted(part, r.hypothesis, **_from(r, part), steps=more, gain=FINE)
-    return sorted(rough, key=lambda x: -_value(x[1], part))
-
-
 class _Whole(NamedTuple):
     """A fit to all records, and the bench of its own that it was fitted to."""
 
     bench: Bench
     refit: Refit
+
+
+class _Known(NamedTuple):
+    """One candidate of a round that is fitted already, and the changes of elements with which all others begin."""
+
+    candidate: Candidate
+    whole: _Whole
+    begin: Float[np.ndarray, " e"]
+
+
+def _round(
+    bench: Bench,
+    every: Sequence[tuple[Candidate, Hypothesis, Any]],
+    without: Refit,
+    effort: Effort,
+    say: Callable[[str], None],
+    known: _Known | None = None,
+) -> Ranking:
+    """Candidates fitted to a part of the records, the best of them to all, and compared."""
+    part = loudest(bench, without)
+    rough = _roughly(part, every, say)
+    first, done, scale = 0, {}, min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
+    if known is not None:
+        first = next(i for i, (c, _) in enumerate(rough) if c is known.candidate)
+        fit = known.whole.refit.fit
+        done, scale = {first: known.whole}, fit.squares / max(fit.equations, 1)
+    top = _value(rough[first][1], bench) if rough else 0.0
+
+    def thorough(i: int) -> _Whole:
+        c, r = rough[i]
+        say(f"{c.kind} at {_label(c.place)}, thoroughly")
+        changes = changes_of(r, bench) if known is None else known.begin
+        return _whole(bench, r.hypothesis, {"changes": changes}, effort)
+
+    close = [(top - _value(r, bench)) / scale / effort.temperature < CLOSE for _, r in rough]
+    best = range(min(effort.refined + len(done), len(rough)))
+    due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]
+    done |= dict(zip(due, side_by_side(thorough, due), strict=True))
+    while (values := _values(rough, done, bench, part)) and (i := int(np.argmax(values))) not in done:
+        if not math.isfinite(values[i]):
+            break
+        done[i] = thorough(i)
+    return _compared(rough, values, done, bench, without, effort)
+
+
+def _roughly(
+    part: Bench, every: Sequence[tuple[Candidate, Hypothesis, Any]], say: Callable[[str], None]
+) -> list[tuple[Candidate, Refit]]:
+    """Candidates fitted to a part of the records, best first: some steps for each, more for the best."""
+
+    def begun(one: tuple[Candidate, Hypothesis, Any]) -> tuple[Candidate, Refit]:
+        c, hypothesis, changes = one
+        say(f"{c.kind} at {_label(c.place)}")
+        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
+        return c, refitted(part, hypothesis, changes=changes, steps=steps, gain=FINE)
+
+    rough = side_by_side(begun, every)
+    for few, more in LONGER:
+        rough.sort(key=lambda x: -_value(x[1], part))
+        most = HOPELESS * rough[0][1].fit.squares if rough else 0.0
+        due = [i for i, (_, r) in enumerate(rough[:few]) if not r.fit.settled and r.fit.squares < most]
+        on = partial(_longer, part=part, steps=more)
+        for i, r in zip(due, side_by_side(on, [rough[i][1] for i in due]), strict=True):
+            rough[i] = rough[i][0], r
+    return sorted(rough, key=lambda x: -_value(x[1], part))
+
+
+def _longer(found: Refit, *, part: Bench, steps: int) -> Refit:
+    return refitted(part, found.hypothesis, **_from(found, part), steps=steps, gain=FINE)
 
 
 def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: Effort) -> _Whole:
@@ -332,21 +354,6 @@ def _values(
     ratio = _ratio(bench, part) * math.exp(gain)
     every = (own.get(i, level - ratio * (top - _value(r, bench))) for i, (_, r) in enumerate(rough))
     return [x if math.isfinite(x) else -math.inf for x in every]
-
-
-def _finished(
-    rough: list[tuple[Candidate, Refit]],
-    done: Mapping[int, _Whole],
-    bench: Bench,
-    part: Bench,
-    thoroughly: Callable[[int], None],
-) -> list[float]:
-    """Densities of all, the first of which is that of a thorough fit."""
-    while (values := _values(rough, done, bench, part)) and (i := int(np.argmax(values))) not in done:
-        if not math.isfinite(values[i]):
-            break
-        thoroughly(i)
-    return values
 
 
 def _compared(

@@ -29,6 +29,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS
 from jaxsid.mechanics.effects.prior import Amplitudes
 from jaxsid.mechanics.lumped import GROUND, LumpedModel, free_bodies, second_order
 from jaxsid.mechanics.slots import Slots, nominal_at
+from jaxsid.parallel import side_by_side
 from jaxsid.physical.elements import element_matrices
 
 FREQUENCIES = 15  # tried for a disturbance
@@ -100,10 +101,15 @@ def screen(
     tried = tuple(CATALOGUE) if kinds is None else tuple(kinds)
     hertz = lone_frequencies(settings, left)
     sorts = [x for x in (_rows(model, places, w) for w in ("between", "body", "sensor", "input")) if x.named]
+
+    def of(part: tuple[str, _Rows]) -> list[Candidate]:
+        return _of_sort(model, settings, part[1], motions[part[0]], tolerance, hertz, tried)
+
+    parts = [(name, rows) for name in motions for rows in sorts]
     found: dict[str, list[Candidate]] = {}
-    for name, motion in motions.items():
-        each = [c for rows in sorts for c in _of_sort(model, settings, rows, motion, tolerance, hertz, tried)]
-        order = sorted(each, key=lambda c: -c.evidence)
+    each = list(zip(parts, side_by_side(of, parts), strict=True))
+    for name in motions:
+        order = sorted((c for (on, _), cs in each if on == name for c in cs), key=lambda c: -c.evidence)
         found[name] = [c._replace(motion=name, ranks={name: i + 1}) for i, c in enumerate(order)]
     return _united(found)
 
