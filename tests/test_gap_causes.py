@@ -16,21 +16,17 @@ from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
     ERRORS,
     TEMPERATURE,
-    Explanation,
-    Ranking,
     _distinct,
-    _ranked,
     _values,
     again,
-    alike,
     elements_by_key,
     extended,
-    key_of,
 )
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
 from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
+from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, ranked
 from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
@@ -61,7 +57,7 @@ def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
         for i, e in enumerate(evidences)
         if not math.isnan(e)
     ]
-    return _ranked(every, refit(without), BENCH, TEMPERATURE)
+    return ranked(every, refit(without), BENCH, TEMPERATURE)
 
 
 # keys and numbers
@@ -169,7 +165,7 @@ def test_probabilities_are_tempered_evidences():
 def test_no_effect_at_all_is_an_alternative_too():
     found = ranking(0.0, without=0.0)
     assert found.ranked[0].probability == pytest.approx(0.5)
-    none = _ranked([], refit(0.0), BENCH, TEMPERATURE)
+    none = ranked([], refit(0.0), BENCH, TEMPERATURE)
     assert (none.ranked, none.gain) == ((), 0.0)
     assert _values([], {}, BENCH, BENCH) == []
 
@@ -264,7 +260,7 @@ def two(monkeypatch):
             asked.append([y.kind for y in (x, *others)])
             candidates = [again(x, x.refit), *others]
             every = [(c, fitted(bench, extended(without.hypothesis, c, {}))) for c in candidates]
-            return _ranked([(c, r, r.fit.evidence, 1.0) for c, r in every], without, BENCH, TEMPERATURE)
+            return ranked([(c, r, r.fit.evidence, 1.0) for c, r in every], without, BENCH, TEMPERATURE)
 
         monkeypatch.setattr(module, "refitted", fitted)
         monkeypatch.setattr(module, "rank_again", rank_again)

@@ -7,7 +7,7 @@ from gap_helpers import DT, JOINT, SENSED, chain, drive, record
 from gap_helpers import with_effect as truth
 
 from jaxsid.gap.experiment import _menu, _sensor, experiment_between
-from jaxsid.gap.explain import Explanation
+from jaxsid.gap.ranking import Explanation
 from jaxsid.gap.refit import Hypothesis, refitted
 from jaxsid.mechanics.lumped import Effect
 

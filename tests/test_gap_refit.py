@@ -11,10 +11,10 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from jaxsid import Record
-from jaxsid.gap.explain import _density
 from jaxsid.gap.fit import Fit, _evaluated, _expected, _step, links_of
 from jaxsid.gap.hypothesis import FIXED, coordinates_of, parameter_rows, shifts_of
 from jaxsid.gap.noise import Noise
+from jaxsid.gap.ranking import density
 from jaxsid.gap.refit import (
     Hypothesis,
     Refit,
@@ -394,17 +394,17 @@ def test_noise_is_what_a_fit_leaves_and_a_search_begins_with_the_guess():
 
 def test_density_is_largest_with_the_noise_that_there_is():
     y, level = colored(exact(drive()), 0)
-    density = {}
+    densities = {}
     for part in (0.7, 1.0, 1.4):
         of = with_guess(bench(y, level), part * known(level).rms())
-        density[part] = _density(of, refitted(of, Hypothesis()))
+        densities[part] = density(of, refitted(of, Hypothesis()))
         if part == 1.0:
             anew = weighed_anew(of, refitted(of, Hypothesis()))
-            density["colour"] = _density(anew, refitted(anew, Hypothesis()))
+            densities["colour"] = density(anew, refitted(anew, Hypothesis()))
             count = float((np.asarray(of.blocks[0].weight)[:, of.blocks[0].lead :] > 0).sum())
-    assert density[1.0] > max(density[0.7], density[1.4])
+    assert densities[1.0] > max(densities[0.7], densities[1.4])
     # half of log(1 / (1 - POLE^2)) for every value, next to white noise of the same rms
-    gain = (density["colour"] - density[1.0]) / count
+    gain = (densities["colour"] - densities[1.0]) / count
     assert gain == pytest.approx(-0.5 * np.log(1 - POLE**2), rel=0.15)
 
 

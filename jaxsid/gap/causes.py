@@ -17,13 +17,11 @@ from jaxsid.gap.explain import (
     FURTHER,
     NUMBERS,
     Effort,
-    Explanation,
-    Ranking,
     again,
     element_place,
     elements_by_key,
+    elsewhere,
     extended,
-    key_of,
     rank,
     rank_again,
 )
@@ -33,6 +31,7 @@ from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.null import SIGNIFICANT, Null, null_test
 from jaxsid.gap.places import places_of
+from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import (
     Bench,
@@ -223,14 +222,17 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     steady = unseen(at.bench.model, at.look.scored.places)
     with_steady = _further(at, steady, FIRST, model, seen, say) if steady else at
     at = with_steady if with_steady.selected else at
+    origin, first = at, _candidates(at.look)
     begun = len(at.selected)
-    most, first = MOST_EFFECTS + begun, _candidates(at.look)
-    candidates = first
+    most, candidates = MOST_EFFECTS + begun, first
     for effort in (FIRST, *[FURTHER] * MOST_EFFECTS):
         known = len(at.selected)
         if not candidates:
             break
         at = _further(at, candidates, effort, model, seen, say)
+        if len(at.selected) == known == begun + 1 and not at.look.clear:
+            at = _elsewhere(at, origin, first, model, seen, say)
+            at = _otherwise(at, origin, first, model, seen, say)
         if len(at.selected) == known:
             break
         if steady and known == 0:
@@ -240,12 +242,57 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         at = _reconsidered(at, model, seen, say)
         if len(at.selected) >= most:
             break
-        # what came next to the first effect, in turn with what now comes first
-        now = _varied(_candidates(at.look))
-        candidates = tuple(
-            c for three in zip(now[::2], now[1::2], _varied(first), strict=False) for c in three
-        )
+        candidates = _further_candidates(at.look, first)
     return at
+
+
+def _further_candidates(look: _Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """What came next to the first effect, in turn with what now comes first."""
+    now = _varied(_candidates(look))
+    return tuple(c for three in zip(now[::2], now[1::2], _varied(first), strict=False) for c in three)
+
+
+def _elsewhere(
+    at: _Found,
+    origin: _Found,
+    first: Sequence[Candidate],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> _Found:
+    """Where nothing more explains what an effect leaves: the same law, if it explains more at another place."""
+    once = at.rounds[-1]
+    anew = elsewhere(once, first, origin.before, FIRST, say)
+    if anew is once:
+        return at
+    at = origin.taken(anew)
+    at = at._replace(look=_looked(model, seen, at))
+    if at.look.clear:
+        return at
+    return _further(at, _further_candidates(at.look, first), FURTHER, model, seen, say)
+
+
+def _otherwise(
+    at: _Found,
+    origin: _Found,
+    first: Sequence[Candidate],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> _Found:
+    """Likewise: one hardly told from the effect, if something does beside that."""
+    ranking = at.rounds[-1]
+    best, whole = ranking.ranked[0], len(ranking.bench.blocks)
+    close = (y for y in ranking.ranked[1:] if alike(y, best, ranking) and len(y.refit.fit.states) == whole)
+    y = None if at.look.clear or len(at.selected) > len(origin.selected) + 1 else next(close, None)
+    if y is None:
+        return at
+    say(f"{y.kind} in place of {best.kind}")
+    others = tuple(x for x in ranking.ranked if x is not y)
+    other = origin.taken(ranking._replace(ranked=(y, *others)))
+    other = other._replace(look=_looked(model, seen, other))
+    further = _further(other, _further_candidates(other.look, first), FURTHER, model, seen, say)
+    return further if len(further.selected) > len(at.selected) else at
 
 
 def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -11,18 +11,10 @@ from jaxsid.gap.causes import Causes, causes_of
 from jaxsid.gap.closure import Closure, seen_part
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.experiment import Experiment, experiment_between
-from jaxsid.gap.explain import (
-    ERRORS,
-    Explanation,
-    Key,
-    Ranking,
-    alike,
-    element_place,
-    elements_by_key,
-    key_of,
-)
+from jaxsid.gap.explain import ERRORS, element_place, elements_by_key
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
+from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
 from jaxsid.gap.words import next_experiment, remaining, summary

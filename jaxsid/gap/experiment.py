@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.explain import Explanation
 from jaxsid.gap.free_run import Run, free_run
+from jaxsid.gap.ranking import Explanation
 from jaxsid.gap.refit import Bench, Refit, changes_of, refitted
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import slowest_rate

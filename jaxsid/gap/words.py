@@ -5,9 +5,9 @@ from typing import Any, Protocol, runtime_checkable
 from jaxsid.gap.causes import Causes
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.experiment import Experiment
-from jaxsid.gap.explain import Explanation
 from jaxsid.gap.measure import Gap
 from jaxsid.gap.places import Place
+from jaxsid.gap.ranking import Explanation
 from jaxsid.gap.verdict import Verdict
 from jaxsid.mechanics.lumped import LumpedModel
 

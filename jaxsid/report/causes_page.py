@@ -6,7 +6,8 @@ import numpy as np
 
 from jaxsid.gap.closure import HELD_OUT, Closure, Left
 from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.explain import elements_by_key, key_of
+from jaxsid.gap.explain import elements_by_key
+from jaxsid.gap.ranking import key_of
 from jaxsid.gap.words import kind_words, named, place_words
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.physical.elements import element_matrices

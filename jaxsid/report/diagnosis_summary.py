@@ -6,8 +6,8 @@ from rich.markup import escape
 from rich.panel import Panel
 
 from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.explain import key_of
 from jaxsid.gap.locate import Locations
+from jaxsid.gap.ranking import key_of
 from jaxsid.gap.words import APART, kind_words, place_words
 from jaxsid.report.causes_page import parameters_said
 from jaxsid.report.numbers import change, misfit, percent, share_of, significant, with_std

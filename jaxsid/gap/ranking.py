@@ -1,0 +1,198 @@
+"""How explanations are compared: by the evidence of their fits, as densities of the records in any noise."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsid.gap.refit import Bench, Refit
+from jaxsid.gap.screen import Candidate
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+
+SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
+Key = tuple[str, str, tuple[str, ...]]
+
+
+class Explanation(NamedTuple):
+    """One fitted candidate.
+
+    Attributes:
+        kind: of effect.
+        place: as of an `Effect`.
+        refit: fitted, with the effects found before.
+        evidence: its logarithm, with noise of its own, up to what all of a round share.
+        probability: of all that were tried.
+        left: rms in the noise that the best one leaves.
+    """
+
+    kind: str
+    place: dict[str, Any]
+    refit: Refit
+    evidence: float
+    probability: float
+    left: float
+
+    @property
+    def key(self) -> Key:
+        return key_of(self.kind, self.place)
+
+
+class Ranking(NamedTuple):
+    """All candidates of a round, most probable first, and what the records say without any of them.
+
+    Attributes:
+        ranked: fitted ones.
+        without: the model with what was found before, its numbers within their tolerance.
+        scale: mean square in noise that the best one leaves.
+        temperature: that differences of evidence are divided by, after the scale.
+        bench: that they were fitted to, the noise that of the best one where nothing else tells of it.
+    """
+
+    ranked: tuple[Explanation, ...]
+    without: Refit
+    scale: float
+    temperature: float
+    bench: Bench
+
+    @property
+    def gain(self) -> float:
+        """Tempered evidence of the best one over that of none of them; 0 where there is none."""
+        if not self.ranked:
+            return 0.0
+        return (self.ranked[0].evidence - self.without.fit.evidence) / self.scale / self.temperature
+
+
+def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
+    """Whether records hardly tell two explanations apart.
+
+    Args:
+        x, y: explanations.
+        of: the ranking that they are in.
+    """
+    return abs(x.evidence - y.evidence) / of.scale / of.temperature < SAME
+
+
+def key_of(kind: str, place: Mapping[str, Any]) -> Key:
+    """Kind and place as one value to be compared; the order of two ends does not count."""
+    ((where, ends),) = place.items()
+    named = tuple(sorted(ends)) if where == "between" else (str(ends),)
+    return kind, where, named
+
+
+class Whole(NamedTuple):
+    """A fit to all records, and the bench of its own that it was fitted to."""
+
+    bench: Bench
+    refit: Refit
+
+
+def density(bench: Bench, found: Refit) -> float:
+    """Evidence as a density of the records, whatever the noise: log p(y) up to a constant.
+
+    Args:
+        bench: that the fit is of.
+        found: the fit.
+    """
+    return value(found, bench) + volume(bench)
+
+
+def volume(bench: Bench) -> float:
+    """Logarithm of how densely values in units of the noise lie next to values in those of the sensors.
+
+    Args:
+        bench: records and their noise.
+    """
+    return sum(float(np.log(w).sum()) for w in _weights(bench))
+
+
+def gauge(bench: Bench) -> float:
+    """Mean logarithm of one over the noise.
+
+    Args:
+        bench: records and their noise.
+    """
+    every = np.concatenate([np.log(w) for w in _weights(bench)])
+    return float(every.mean()) if every.size else 0.0
+
+
+def _weights(bench: Bench) -> list[np.ndarray]:
+    """Of what is judged, block by block."""
+    each = (np.asarray(b.weight)[:, b.lead :] for b in bench.blocks)
+    return [w[w > 0] for w in each]
+
+
+def value(found: Refit, bench: Bench) -> float:
+    """Evidence; none of what makes no sense.
+
+    Args:
+        found: a fit.
+        bench: that it is of.
+    """
+    return found.fit.evidence if sensible(found, bench) else -math.inf
+
+
+def sensible(found: Refit, bench: Bench) -> bool:
+    """Whether each law has parameters that it is meant for, and that windows can tell.
+
+    A mode that is slower than a window is a force of its own in each, which explains anything.
+
+    Args:
+        found: a fit.
+        bench: that it is of.
+    """
+    block = bench.blocks[0] if bench.blocks else None
+    for effect in found.hypothesis.effects:
+        kind = CATALOGUE[effect.kind]
+        values = {p.name: float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters}
+        if kind.sensible is not None and not kind.sensible(*values.values()):
+            return False
+        if kind.vibrates is None or block is None:
+            continue
+        lasts = float(block.dt) * (block.y.shape[1] - block.lead)
+        if kind.vibrates(*values.values()) * lasts < 2 * math.pi:
+            return False
+    return True
+
+
+def left_in(bench: Bench, whole: Whole) -> float:
+    """What a fit leaves, rms, in the noise of a bench, which need not be the fit's own.
+
+    Args:
+        bench: tells the noise.
+        whole: the fit.
+    """
+    fit = whole.refit.fit
+    return math.sqrt(fit.squares / max(fit.equations, 1)) * math.exp(gauge(bench) - gauge(whole.bench))
+
+
+def ranked(
+    every: Sequence[tuple[Candidate | Explanation, Refit, float, float]],
+    without: Refit,
+    bench: Bench,
+    temperature: float,
+) -> Ranking:
+    """Fits in order.
+
+    Args:
+        every: what it is, its fit, evidence, and rms that it leaves, all in the noise of the bench.
+        without: the fit without any of them.
+        bench: of the best one.
+        temperature: of the round.
+    """
+    every = sorted(every, key=lambda x: -x[2])
+    first = every[0][1].fit if every else without.fit
+    scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
+    values = np.array([x[2] for x in every] + [without.fit.evidence]) / scale / temperature
+    weights = np.exp(values - values.max())
+    weights = weights / weights.sum()
+    return Ranking(
+        tuple(
+            Explanation(c.kind, dict(c.place), r, e, float(w), left)
+            for (c, r, e, left), w in zip(every, weights[:-1], strict=True)
+        ),
+        without,
+        scale,
+        temperature,
+        bench,
+    )

@@ -1,0 +1,180 @@
+"""Which candidates of a round are fitted, and what follows where nothing more explains what an effect leaves."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
+
+from jaxsid.gap import causes, explain
+from jaxsid.gap import ranking as ranking_of
+from jaxsid.gap.causes import _Found, _otherwise
+from jaxsid.gap.explain import HERE, TEMPERATURE, _roughly, extended
+from jaxsid.gap.ranking import Whole
+from jaxsid.gap.refit import Hypothesis
+
+B13 = {"between": ("b1", "b3")}
+LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping"]
+
+
+def silent(text: str) -> None:
+    """Says nothing."""
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """Kinds and places in the order in which they were fitted, with evidence as told; `senseless` ones make none."""
+
+    def run(candidates, evidences, first, senseless=()):
+        fitted = []
+
+        def fit(part, hypothesis, **_):
+            effect = hypothesis.effects[-1]
+            key = effect.kind, effect.place[0][1]
+            if key not in fitted:
+                fitted.append(key)
+            return refit(evidences.get(key, -1e6), hypothesis=hypothesis)
+
+        monkeypatch.setattr(explain, "refitted", fit)
+        monkeypatch.setattr(explain, "changes_of", lambda found, bench: None)
+        monkeypatch.setattr(explain, "side_by_side", lambda f, xs: [f(x) for x in xs])
+        monkeypatch.setattr(
+            ranking_of, "sensible", lambda found, bench: found.hypothesis.effects[-1].kind not in senseless
+        )
+        every = [(c, extended(Hypothesis(), c, {}), None) for c in candidates]
+        return fitted, _roughly(BENCH, every, first, silent)
+
+    return run
+
+
+def test_further_laws_are_tried_where_the_best_one_acts(tried):
+    candidates = [candidate("backlash", B23), candidate("stribeck_friction", B12)]
+    candidates += [candidate(k, p) for k in LAWS[1:] for p in (B12, B13, B23)]
+    candidates += [candidate("coulomb_friction", B12)]
+    evidences = {("stribeck_friction", ("b1", "b2")): -10.0, ("backlash", ("b2", "b3")): -50.0}
+    fitted, rough = tried(candidates, evidences, 2)
+    here = [(k, ("b1", "b2")) for k in LAWS[1 : 1 + HERE]]
+    assert fitted == [("backlash", ("b2", "b3")), ("stribeck_friction", ("b1", "b2")), *here]
+    assert rough[0][0].kind == "stribeck_friction"
+
+
+def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):
+    candidates = [candidate("backlash", B23), candidate("stribeck_friction", B12)]
+    candidates += [candidate("hysteresis", B13), candidate("coulomb_friction", B12)]
+    evidences = {
+        ("stribeck_friction", ("b1", "b2")): -10.0,
+        ("backlash", ("b2", "b3")): -50.0,
+        ("coulomb_friction", ("b1", "b2")): -12.0,
+    }
+    fitted, rough = tried(candidates, evidences, 2, senseless=("stribeck_friction",))
+    assert [c.kind for c, _ in rough] == ["coulomb_friction", "backlash", "stribeck_friction"]
+    assert ("hysteresis", ("b1", "b3")) not in fitted
+
+
+def test_a_round_without_candidates_has_no_fits(tried):
+    assert tried([], {}, 5) == ([], [])
+
+
+# where nothing more explains what is left
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """An effect with another that is hardly told from it; what is found beside either."""
+
+    def run(evidences=(0.0, -TEMPERATURE, -40 * TEMPERATURE), clear=False, beside=("end_stop",), whole=True):
+        first = ranking(*evidences)
+        bench = BENCH if whole else BENCH._replace(blocks=(SimpleNamespace(),))
+        first = first._replace(bench=bench)
+        look = SimpleNamespace(clear=clear)
+        origin = _Found(bench, "begun", (), (), None)
+        at = origin._replace(look=look, rounds=(first,), selected=first.ranked[:1], before=refit(0.0))
+
+        def taken(self, of):
+            return self._replace(rounds=(of,), selected=(*self.selected, of.ranked[0]))
+
+        def further(other, candidates, *_):
+            kinds = [k for k in beside if other.selected[0].kind == "backlash"]
+            more = [ranking(0.0, kinds=[(k, B23)]) for k in kinds]
+            return other._replace(
+                rounds=(*other.rounds, *more), selected=(*other.selected, *(m.ranked[0] for m in more))
+            )
+
+        monkeypatch.setattr(_Found, "taken", taken)
+        monkeypatch.setattr(causes, "_looked", lambda *_: look)
+        monkeypatch.setattr(causes, "_further_candidates", lambda look, first: ())
+        monkeypatch.setattr(causes, "_further", further)
+        return at, _otherwise(at, origin, (), BENCH.model, (), silent)
+
+    return run
+
+
+def test_what_is_hardly_told_apart_is_tried_where_nothing_more_is_found(searched):
+    _, found = searched()
+    assert [x.kind for x in found.selected] == ["backlash", "end_stop"]
+    # its round stays whole
+    assert [x.kind for x in found.rounds[0].ranked] == ["backlash", "cubic_stiffness", "end_stop"]
+    np.testing.assert_allclose(sum(x.probability for x in found.rounds[0].ranked), 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"clear": True},  # nothing is left
+        {"evidences": (0.0, -40 * TEMPERATURE)},  # nothing is like it
+        {"beside": ()},  # nothing more is found beside the other either
+        {"whole": False},  # the other was fitted to a part of the records only
+    ],
+)
+def test_else_the_first_effect_stays(searched, case):
+    at, found = searched(**case)
+    assert found is at
+
+
+# the same law at other places
+
+
+@pytest.fixture
+def moved(monkeypatch):
+    """A round that hysteresis at b1 - b2 won; thorough fits elsewhere have the evidence told, in noise as told."""
+
+    def run(evidences, candidates):
+        fitted = []
+        first = ranking(0.0, -20 * TEMPERATURE, kinds=[("hysteresis", B12), ("hysteresis", B13)])
+
+        def whole(bench, hypothesis, start, effort):
+            place = hypothesis.effects[-1].place[0][1]
+            fitted.append(place)
+            return Whole(BENCH._replace(jump=0.1), refit(evidences[place], hypothesis=hypothesis))
+
+        monkeypatch.setattr(explain, "_whole", whole)
+        monkeypatch.setattr(explain, "refitted", lambda bench, hypothesis, **_: refit(-1e4))
+        monkeypatch.setattr(explain, "changes_of", lambda found, bench: None)
+        for module in (explain, ranking_of):
+            monkeypatch.setattr(module, "gauge", lambda bench: 0.0)
+            monkeypatch.setattr(module, "volume", lambda bench: 0.0)
+        monkeypatch.setattr(explain, "side_by_side", lambda f, xs: [f(x) for x in xs])
+        return first, fitted, explain.elsewhere(first, candidates, None, explain.FIRST)
+
+    return run
+
+
+LOOP = {"stiffness": 1.0, "beta": 1.0, "gamma": 0.0, "exponent": 1.0}
+HYSTERESIS = [candidate("hysteresis", p, **LOOP) for p in (B12, B13, B23)]
+
+
+def test_the_law_is_placed_anew_where_it_explains_more(moved):
+    other = candidate("backlash", B23, stiffness=1.0)
+    _, fitted, found = moved({("b1", "b3"): 5 * TEMPERATURE, ("b2", "b3"): -9.0}, [other, *HYSTERESIS])
+    assert fitted == [("b1", "b3"), ("b2", "b3")]  # neither other laws nor its own place again
+    assert [x.place["between"] for x in found.ranked] == [("b1", "b3"), ("b1", "b2"), ("b2", "b3")]
+    assert found.bench.jump == 0.1
+    assert sum(x.probability for x in found.ranked) == pytest.approx(1.0, abs=1e-6)
+    assert found.ranked[0].probability / found.ranked[1].probability == pytest.approx(np.exp(5), rel=1e-6)
+
+
+def test_the_round_stays_where_the_law_explains_no_more_elsewhere(moved):
+    first, fitted, found = moved({("b1", "b3"): -1.0, ("b2", "b3"): -2.0}, HYSTERESIS)
+    assert len(fitted) == 2
+    assert found is first
+    assert moved({}, HYSTERESIS[:1])[2] == first  # nowhere else to go
