@@ -48,7 +48,7 @@ bench-calibration: $(STAMP)
 
 # Diagnoses of systems whose effects are withheld; goes on where it stopped. Cases and results stay in build/blind.
 blind: $(STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/blind/generate.py build/blind --set test --cases 240
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/blind/generate.py build/blind --set test --cases 240 --samples 4000 2000
 	$(BIN)/python benchmarks/blind/run.py build/blind
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/blind/baselines.py build/blind
 	$(BIN)/python benchmarks/blind/score.py build/blind
