@@ -130,6 +130,9 @@ def test_the_closure_is_that_of_what_is_left():
     )
     assert found.by_sensor["a"] == pytest.approx(by_hand, rel=1e-3)
     assert set(found.by_sensor) == {"a", "b"}
+    assert found.noise_by_sensor["a"] == pytest.approx(noise, rel=0.05)
+    pooled = np.sqrt(np.mean(np.square(list(found.noise_by_sensor.values()))))
+    assert pooled == pytest.approx(found.noise_floor)
     assert set(found.as_dict()) == {
         "heldout_before",
         "heldout_recalibrated",
@@ -139,6 +142,7 @@ def test_the_closure_is_that_of_what_is_left():
         "ci95",
         "against_recalibrated",
         "by_sensor",
+        "noise_by_sensor",
     }
 
 

@@ -6,7 +6,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, record
 from scipy.signal import lfilter
 
 from jaxsid.checks import InputError
-from jaxsid.gap.noise import noise_of, period_of, quiet_part, residual_noise
+from jaxsid.gap.noise import Noise, noise_of, period_of, quiet_part, quieter, residual_noise
 
 LEVEL = 0.05
 
@@ -55,6 +55,19 @@ def test_an_effect_is_not_taken_for_noise():
     white = LEVEL * np.random.default_rng(0).standard_normal((SAMPLES, 3))
     (noise,) = noise_of(chain(factor=1.2), [record(u, exact(u) + white)])
     assert (noise.level < 3 * LEVEL).all()
+
+
+def test_a_guess_is_no_more_than_what_is_left():
+    """Sensor by sensor; what was measured stands, and so does the guess for a sensor that is absent."""
+    taps = np.tile([1.0, -0.5], (3, 1))
+    guess = Noise(np.array([8.0, 1.0, np.nan]), np.tile([1.0, 0.0], (3, 1)), 0.0, "residual")
+    left = Noise(np.array([0.7, 2.0, np.nan]), taps, 0.0, "residual")
+    found = quieter(guess, left)
+    np.testing.assert_array_equal(found.level, [0.7, 1.0, np.nan])
+    np.testing.assert_array_equal(found.taps, [[1.0, -0.5], [1.0, 0.0], [1.0, 0.0]])
+    assert (found.rms()[:2] <= np.minimum(guess.rms(), left.rms())[:2]).all()
+    measured = Noise(guess.level, guess.taps, 500.0, "periods")
+    np.testing.assert_array_equal(quieter(measured, left).level, guess.level)
 
 
 def test_lines_have_the_deviation_that_is_said():

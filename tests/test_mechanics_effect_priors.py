@@ -90,7 +90,7 @@ def test_scales_in_symbols():
 
 
 def test_amplitudes_of_places():
-    """A joint carries its spring's and damper's force, a place without one what accelerates its ends."""
+    """A joint carries its spring's and damper's force, or what accelerates its ends if that is more."""
     model = systems.three_dof()
     bodies = model.bodies
     places = [
@@ -114,16 +114,31 @@ def test_amplitudes_of_places():
     M, D, K = (np.asarray(a) for a in (linear.mass, linear.damping, linear.stiffness))
     rms = lambda a: np.sqrt((a**2).mean())  # noqa: E731
     net = u @ np.asarray(linear.input_matrix).T - x @ K.T - v @ D.T
+    assert not K[0, 2]
+    assert not D[0, 2]
     across = -K[0, 1] * (x[:, 1] - x[:, 0]) - D[0, 1] * (v[:, 1] - v[:, 0])
-    expected = [rms(across), rms(net[:, 2] - net[:, 0]) / 2, rms(net[:, 1])]
-    if K[0, 2] or D[0, 2]:
-        expected[1] = rms(-K[0, 2] * (x[:, 2] - x[:, 0]) - D[0, 2] * (v[:, 2] - v[:, 0]))
+    shared = [rms(net[:, j] - net[:, 0]) / 2 for j in (1, 2)]
+    expected = [max(rms(across), shared[0]), shared[1], rms(net[:, 1])]
     np.testing.assert_allclose(found.force[:3], expected)
     np.testing.assert_allclose(found.displacement[0], rms(x[:, 1] - x[:, 0]))
     np.testing.assert_allclose(found.velocity[2], rms(v[:, 1]))
     np.testing.assert_allclose(found.signal[3:], [rms(y[:, 0]), rms(u[:, 0])])
     slowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min())
     np.testing.assert_allclose(found.rate, slowest)
+
+
+def test_a_light_bearing_may_rub_far_more_than_it_carries():
+    """A servo motor's bearing drags little at any speed; what could rub there is a part of what drives the motor."""
+    bearing = [Connection("bearing", ("ground", "motor")), Connection("gear", ("motor", "load"))]
+    torque = [Input("torque", "motor")]
+    model = jaxsid.lumped_model(
+        ["motor", "load"], [0.005, 0.2], [0.0, 9e3], [0.4, 0.8], connections=bearing, inputs=torque
+    )
+    rubs = Effect("coulomb_friction", (("between", ("ground", "motor")),), {"force": 1.0})
+    slots = slots_of(dataclasses.replace(model, effects=(rubs,)))
+    v = jnp.asarray(0.1 * np.random.default_rng(0).standard_normal((300, 1))) * jnp.ones(2)
+    force = amplitudes(second_order(model), slots, 0 * v, v, 3 * jnp.ones((300, 1)), v[:, :0], 1e-3).force
+    assert float(force[0]) == pytest.approx(3.0, rel=0.01)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -7,7 +7,15 @@ import pytest
 from reference_markov import CHAIN, markov, rebuilt
 
 import jaxsid.realization.era as module
+from jaxsid.realization import subspace
 from jaxsid.realization.era import era
+from jaxsid.realization.hankel import (
+    DenseOperator,
+    FourierOperator,
+    fast_length,
+    hankel_matrix,
+    hankel_operator,
+)
 from jaxsid.realization.outputs import few_outputs
 from jaxsid.records import ImpulseResponse
 
@@ -52,6 +60,30 @@ def test_the_answer_is_that_of_the_full_decomposition(noise):
     assert found.C.shape == (OUTPUTS, ORDER)
     assert found.observability.shape == (20 * OUTPUTS, ORDER)
     as_svd(found, h, 1e-10)
+
+
+@pytest.mark.parametrize("dense", [False, True])
+@pytest.mark.parametrize("columns", [tuple(range(30)), (0, 2, 3, 11, 20)])
+def test_gram_matrix(dense, columns):
+    rows = (0, 1, 4, 5, 17)
+    h = many(0.01)
+    matrix = np.asarray(hankel_matrix(h, rows, columns, 1))
+    length = fast_length(len(h) - 1)
+    by_fourier = FourierOperator(jnp.fft.rfft(h[1:], length, axis=0), rows, columns, length)
+    operator = DenseOperator(jnp.asarray(matrix)) if dense else by_fourier
+    np.testing.assert_allclose(operator.gram(), matrix.T @ matrix, rtol=0, atol=1e-13 * (matrix**2).sum())
+
+
+def test_from_the_gram_matrix_nothing_is_left_to_do_where_there_is_noise(monkeypatch):
+    """Without restarts and without a full decomposition the answer is still that of one."""
+    monkeypatch.setattr(subspace, "_coarse", lambda state, order: jnp.array(False))
+    steps = tuple(range(20)), tuple(range(30))
+    operator = hankel_operator(many(0.01), *steps, 1)
+    found = subspace.dominant_subspace(operator, ORDER, False)
+    u, s, vt = np.linalg.svd(np.asarray(hankel_matrix(many(0.01), *steps, 1)), full_matrices=False)
+    np.testing.assert_allclose(found.values[:ORDER], s[:ORDER], rtol=1e-13)
+    np.testing.assert_allclose(np.abs(np.sum(u[:, :ORDER] * found.left, axis=0)), 1, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(vt[:ORDER].T * found.right, axis=0)), 1, atol=1e-12)
 
 
 def test_both_in_one_batch():

@@ -28,7 +28,7 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored, scored
 from jaxsid.gap.measure import is_free_or_unstable
-from jaxsid.gap.noise import Noise
+from jaxsid.gap.noise import Noise, quieter
 from jaxsid.gap.null import SIGNIFICANT, Null, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of
@@ -75,7 +75,7 @@ class Causes(NamedTuple):
         lefts: what each of these leaves of these samples.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
-        noises: of each record, from what the chosen model leaves where tests find nothing in it.
+        noises: of each record, what the chosen model leaves where tests find nothing in it, else no more than that.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
     """
@@ -170,8 +170,8 @@ def causes_of(
     ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
-    # what is left is noise where tests find nothing in it; else it may be less
-    floor = bench.noises if look.clear else found.noises
+    # what is left is noise where tests find nothing in it, else more than that
+    floor = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
     *each, alone = (closure_of(*ends, x, floor, names) for x in (*steps, ends[1]))
     return Causes(
         rounds,

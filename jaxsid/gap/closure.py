@@ -45,6 +45,7 @@ class Closure(NamedTuple):
         ci95: interval of that.
         against_recalibrated: the fraction of the best linear model's gap.
         by_sensor: NRMSE of the chosen model.
+        noise_by_sensor: that of noise alone.
     """
 
     before: float
@@ -55,6 +56,7 @@ class Closure(NamedTuple):
     ci95: tuple[float, float]
     against_recalibrated: float
     by_sensor: dict[str, float]
+    noise_by_sensor: dict[str, float]
 
     def as_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""
@@ -67,6 +69,7 @@ class Closure(NamedTuple):
             "ci95": list(self.ci95),
             "against_recalibrated": self.against_recalibrated,
             "by_sensor": self.by_sensor,
+            "noise_by_sensor": self.noise_by_sensor,
         }
 
 
@@ -206,7 +209,6 @@ def closure_of(
         rows = rng.integers(0, len(every), len(every))
         draws.append(fraction(pooled(parts[0], rows), pooled(parts[2], rows), pooled(floor, rows)))
     low, high = np.quantile(draws, [0.025, 0.975])
-    each = relative(parts[2], every)
     return Closure(
         b,
         r,
@@ -215,7 +217,7 @@ def closure_of(
         fraction(b, a, n),
         (float(low), float(high)),
         fraction(r, a, n),
-        dict(zip(names, each.tolist(), strict=True)),
+        *(dict(zip(names, relative(x, every).tolist(), strict=True)) for x in (parts[2], floor)),
     )
 
 

@@ -69,6 +69,11 @@ class Examination(NamedTuple):
     fit: Recalibrated
     scored: Scored | None
 
+    @property
+    def at_most(self) -> bool:
+        """Whether the noise is guessed from the quietest band, where the gap may still be larger than it."""
+        return self.finding == "structure" and any(n.degrees <= 0 for n in self.noises)
+
     def as_dict(self) -> dict[str, Any]:
         """The parts `gap` and `locations` of diagnosis.json."""
         found = self.locations.ranked if self.locations is not None else ()

@@ -208,6 +208,18 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 
+def quieter(guess: Noise, left: Noise) -> Noise:
+    """Each sensor's noise where all that tells of it is a guess: no more than a model leaves.
+
+    Args:
+        guess: of a record; it stands where it is no guess.
+        left: what a model leaves of that record, taken for noise.
+    """
+    less = (guess.degrees <= 0) & (left.rms() < guess.rms())
+    level = np.where(less, left.level, guess.level)
+    return Noise(level, np.where(less[:, None], left.taps, guess.taps), guess.degrees, guess.source)
+
+
 def floor(spectra: Spectra) -> Noise:
     """White noise of the level of the quietest band of what a model leaves.
 

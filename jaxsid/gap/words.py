@@ -139,7 +139,7 @@ def remaining(found: Found) -> str:
     band = _loudest(gap)
     return (
         f"What remains: {percent(closure.by_sensor[worst])} of {worst}, where noise alone leaves "
-        f"{percent(closure.noise_floor)}; the linear model misses most at {band}."
+        f"{percent(closure.noise_by_sensor[worst])}; the linear model misses most at {band}."
     )
 
 

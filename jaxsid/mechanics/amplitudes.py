@@ -19,8 +19,8 @@ def amplitudes(
 ) -> Amplitudes:
     """Rms values at the place of every slot, each (slots,).
 
-    What a place carries is k d + c v where the model has a connection there; else, and on a body, the sum of all that
-    acts on it, B u - K x - D x', shared between its ends.
+    What a place carries is the larger of the sum of all that acts on its ends, B u - K x - D x', shared between them,
+    and of k d + c v where the model has a connection there: a light bearing carries little, and may rub far more.
 
     Args:
         linear: M, D, K and inputs, without effects.
@@ -39,14 +39,15 @@ def amplitudes(
         (nominal.stiffness != 0) | (nominal.damping != 0)
     )
     whole = net @ slots.joints.T / jnp.maximum(ends, 1.0)
-    force = jnp.where(between, nominal.stiffness * d + nominal.damping * v, whole)
+    joined = jnp.where(between, nominal.stiffness * d + nominal.damping * v, 0.0)
+    force = jnp.maximum(_rms(joined), _rms(whole))
     read = jnp.sqrt(jnp.nanmean(y**2, axis=0))
     slowest = _slowest(linear)
     # a free axis has no mode: half a period in the record
     rate = jnp.where(jnp.isfinite(slowest), jnp.sqrt(slowest), jnp.pi / (len(u) * dt))
     signal = slots.sensors @ jnp.where(jnp.isfinite(read), read, 0.0) + slots.inputs @ _rms(u)
     same = jnp.ones_like(ends)
-    return Amplitudes(_rms(force), _rms(d), _rms(v), signal, rate * same, len(u) * dt * same)
+    return Amplitudes(force, _rms(d), _rms(v), signal, rate * same, len(u) * dt * same)
 
 
 def _rms(x: Array) -> Array:

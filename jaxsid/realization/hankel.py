@@ -36,6 +36,10 @@ class DenseOperator(eqx.Module):
         """Product with the transposed matrix."""
         return self.matrix.T @ u
 
+    def gram(self) -> Float[Array, "cols cols"]:
+        """The transposed matrix times the matrix."""
+        return self.matrix.T @ self.matrix
+
 
 class FourierOperator(eqx.Module):
     """A block Hankel matrix that is never formed: products are correlations, done by the Fourier transform.
@@ -63,6 +67,20 @@ class FourierOperator(eqx.Module):
     def rmv(self, u: Float[Array, "rows k"]) -> Float[Array, "cols k"]:
         """Product with the transposed block Hankel matrix."""
         return _correlate(self.spectrum, u, self.rows, self.columns, self.length)
+
+    def gram(self) -> Float[Array, "cols cols"]:
+        """The transposed matrix times the matrix, sum_i g[s_i + t_j]' g[s_i + t_k]: few products of samples."""
+        g = jnp.fft.irfft(self.spectrum, self.length, axis=0)
+        products = jnp.einsum("top,soq->tpsq", g, g)
+        columns = np.asarray(self.columns)
+
+        def added(total: Array, row: Array) -> tuple[Array, None]:
+            return total + products[row + columns][:, :, row + columns], None
+
+        inputs, count = g.shape[2], len(columns)
+        zero = jnp.zeros((count, inputs, count, inputs), g.dtype)
+        total = lax.scan(added, zero, jnp.asarray(self.rows))[0]
+        return total.reshape(count * inputs, count * inputs)
 
 
 Operator = DenseOperator | FourierOperator

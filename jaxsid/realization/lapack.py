@@ -1,4 +1,4 @@
-"""QR and singular value decompositions of batches, one at a time on CPU.
+"""QR, singular value and eigenvalue decompositions of batches, one at a time on CPU.
 
 jaxlib's batched LAPACK calls on CPU wait, inside the thread pool, for other threads of it; two of them at
 once, or one and a Fourier transform, can lock each other out for good on a machine of few cores. A loop
@@ -28,3 +28,4 @@ def one_at_a_time(decompose: Callable[[jax.Array], Any]) -> Callable[[jax.Array]
 
 qr = one_at_a_time(lambda x: tuple(jnp.linalg.qr(x)))
 svd = one_at_a_time(lambda x: tuple(jnp.linalg.svd(x, full_matrices=False)))
+eigh = one_at_a_time(lambda x: tuple(jnp.linalg.eigh(x)))

@@ -2,9 +2,9 @@
 
 The iteration goes on until the residual of the kept singular triplets reaches rounding, or vanishes beside the first
 discarded singular value, which is noise: the answer is that of a full singular value decomposition whatever the gap
-at the cut. Where that gap is small and the matrix not large, the full decomposition takes over. Products with the
-transposed matrix are never paired into a Gram matrix, which would lose everything below 1e-8 of the largest singular
-value.
+at the cut. Where that gap is small and the matrix not large, the full decomposition takes over. The Gram matrix, which
+loses everything below 1e-8 of the largest singular value, serves for nothing but a start, where it is far smaller than
+the matrix: with noise, which lies above that, the iteration then has nothing left to do.
 Source: Musco and Musco, "Randomized block Krylov methods", NeurIPS 2015; Baglama and Reichel, SIAM J. Sci.
 Comput. 27, 2005 (restarting).
 """
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsid.realization.hankel import LARGEST_DENSE, DenseOperator
-from jaxsid.realization.lapack import qr, svd
+from jaxsid.realization.lapack import eigh, qr, svd
 
 # Most searches end after one or two restarts; where a full decomposition is not dear it then takes over.
 FEW_RESTARTS, RESTARTS = 2, 120
@@ -30,6 +30,7 @@ RESIDUAL, UNSEEN = 30.0, 1e-9
 CG_STEPS = 300
 ROUGH_RESTARTS = 2
 BLOCK_ELEMENTS = 4096  # of a block of rows in a QR factorization
+TALL = 8  # rows for each column, from which on the Gram matrix costs less than a restart
 
 
 @runtime_checkable
@@ -42,6 +43,13 @@ class LinearOperator(Protocol):
     def mv(self, v: Array) -> Array: ...
 
     def rmv(self, u: Array) -> Array: ...
+
+
+@runtime_checkable
+class WithGram(LinearOperator, Protocol):
+    """An operator that knows its transposed matrix times its matrix."""
+
+    def gram(self) -> Array: ...
 
 
 class Subspace(NamedTuple):
@@ -183,10 +191,13 @@ def _residual(state: _State, order: int) -> Array:
 
 
 def _start(operator: LinearOperator, width: int) -> _State:
-    """Triplets from the image of random vectors."""
-    cols = operator.shape[1]
+    """Triplets from the image of random vectors, or of the eigenvectors of a Gram matrix that is small."""
+    rows, cols = operator.shape
     dtype = jax.eval_shape(operator.mv, jax.ShapeDtypeStruct((cols, 1), jnp.result_type(float))).dtype
-    start = jax.random.uniform(jax.random.key(0), (cols, width), dtype, -1.0, 1.0)
+    if isinstance(operator, WithGram) and cols <= LARGEST_SIDE and rows >= TALL * cols:
+        start = eigh(operator.gram())[1][:, -width:]
+    else:
+        start = jax.random.uniform(jax.random.key(0), (cols, width), dtype, -1.0, 1.0)
     basis = _orthonormal(operator.mv(start))
     left, values, right = _triplets(basis, operator.rmv(basis), width)
     later = jnp.zeros(_values_kept(operator, width) - width, dtype)

@@ -210,7 +210,7 @@ def closure_section(found: Diagnosis) -> Section:
     for i, (x, step) in enumerate(zip(causes.selected, causes.closures, strict=False)):
         said = Cell(f"{'with' if i == 0 else 'and'} {kind_words(x.kind)}", place_words(x.place))
         rows.append(_closure_row(said, step.after, step.by_sensor, names))
-    rows.append(_closure_row("noise alone", closure.noise_floor, _noise_by_sensor(found, every), names))
+    rows.append(_closure_row("noise alone", closure.noise_floor, closure.noise_by_sensor, names))
     low, high = closure.ci95
     note = (
         f"NRMSE on the last {percent(HELD_OUT)} of every record. Of the nominal model's gap above the noise "
@@ -218,7 +218,7 @@ def closure_section(found: Diagnosis) -> Section:
         "Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
         "before, a after and n the noise."
     )
-    if causes.noises is not found.examination.noises:
+    if causes.noises is not found.examination.noises and causes.places is None:
         note += " The noise is that which the chosen model leaves of the other samples, where tests find nothing in it."
     table = Table(("Model", "All sensors", *names), tuple(rows), "", note)
     return Section("How far it shrinks", (table,))
@@ -240,14 +240,6 @@ def _by_sensor(x: Left, names: list[str]) -> dict[str, float]:
     """NRMSE of each sensor over all records."""
     left = np.sum([np.nansum(a**2, axis=0) for a in x.left], axis=0)
     return dict(zip(names, np.sqrt(left / _spread(x)).tolist(), strict=True))
-
-
-def _noise_by_sensor(found: Diagnosis, names: list[str]) -> dict[str, float]:
-    assert found.causes is not None
-    left, noises = found.causes.lefts[-1], found.causes.noises
-    counts = [np.isfinite(y).sum(axis=0) for y in left.measured]
-    power = np.sum([np.nan_to_num(n.rms()) ** 2 * k for n, k in zip(noises, counts, strict=True)], axis=0)
-    return dict(zip(names, np.sqrt(power / _spread(left)).tolist(), strict=True))
 
 
 def _spread(x: Left) -> np.ndarray:

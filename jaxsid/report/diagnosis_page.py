@@ -155,7 +155,8 @@ def _gap_cards(found: Diagnosis) -> tuple[Card, ...]:
 
 def _gap(found: Diagnosis) -> Section:
     seen = found.examination
-    header = ("Sensor", "Nominal", "Refitted", "Noise alone", "Gap (noise = 1)", "Refitted (noise = 1)")
+    alone = "Noise, at most" if seen.at_most else "Noise alone"
+    header = ("Sensor", "Nominal", "Refitted", alone, "Gap (noise = 1)", "Refitted (noise = 1)")
     rows = tuple(
         (
             name,
@@ -173,6 +174,7 @@ def _gap(found: Diagnosis) -> Section:
         f"NRMSE: rms of measured less modelled over the standard deviation of the measured signal, {how}, each "
         "from the initial state that suits the model best. The gap in noise is what is left, made white, over the "
         f"noise: 1 is noise alone. Noise from: {', '.join(dict.fromkeys(n.source for n in seen.noises))}."
+        + (" It is what the refitted model leaves of the quietest band." if seen.at_most else "")
     )
     pictures = [
         picture(

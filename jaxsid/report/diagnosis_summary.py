@@ -53,9 +53,8 @@ def _effects(found: Diagnosis):
 
 def _gap(found: Diagnosis):
     seen = found.examination
-    made = table(
-        "Misfit (NRMSE)", "sensor", "nominal", "refitted", "noise alone", "gap (noise = 1)", "refitted"
-    )
+    alone = "noise at most" if seen.at_most else "noise alone"
+    made = table("Misfit (NRMSE)", "sensor", "nominal", "refitted", alone, "gap (noise = 1)", "refitted")
     for name in seen.before.nrmse:
         made.add_row(
             escape(name),

@@ -16,7 +16,7 @@ class Amplitudes(NamedTuple):
     """How a place moves in a record.
 
     Attributes:
-        force: rms of what the connection there carries, or, where there is none, of all forces on the place together.
+        force: rms of what the connection there carries, or of all forces on the place together if that is larger.
         displacement: rms, across the place.
         velocity: rms, across the place.
         signal: rms of the sensor's reading or of the input; of no meaning at other places.
