@@ -310,7 +310,7 @@ def examination(nominal=1e-9, structural=1e-9):
 
 def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
     ends = fraction(before, after, floor), (0.0, 1.0), fraction(recalibrated, after, floor)
-    return Closure(before, recalibrated, after, floor, *ends, {})
+    return Closure(before, recalibrated, after, floor, *ends, {}, {})
 
 
 def causes(*rounds, closures):
