@@ -70,8 +70,8 @@ class Examination(NamedTuple):
     scored: Scored | None
 
     @property
-    def at_most(self) -> bool:
-        """Whether the noise is guessed from the quietest band, where the gap may still be larger than it."""
+    def guessed(self) -> bool:
+        """Whether noise is a guess from the quietest band: too high if the gap is there too, too low if coloured."""
         return self.finding == "structure" and any(n.degrees <= 0 for n in self.noises)
 
     def as_dict(self) -> dict[str, Any]:

@@ -155,7 +155,7 @@ def _gap_cards(found: Diagnosis) -> tuple[Card, ...]:
 
 def _gap(found: Diagnosis) -> Section:
     seen = found.examination
-    alone = "Noise, at most" if seen.at_most else "Noise alone"
+    alone = "Noise, guessed" if seen.guessed else "Noise alone"
     header = ("Sensor", "Nominal", "Refitted", alone, "Gap (noise = 1)", "Refitted (noise = 1)")
     rows = tuple(
         (
@@ -174,7 +174,7 @@ def _gap(found: Diagnosis) -> Section:
         f"NRMSE: rms of measured less modelled over the standard deviation of the measured signal, {how}, each "
         "from the initial state that suits the model best. The gap in noise is what is left, made white, over the "
         f"noise: 1 is noise alone. Noise from: {', '.join(dict.fromkeys(n.source for n in seen.noises))}."
-        + (" It is what the refitted model leaves of the quietest band." if seen.at_most else "")
+        + (" A guess: what the refitted model leaves of the quietest band." if seen.guessed else "")
     )
     pictures = [
         picture(

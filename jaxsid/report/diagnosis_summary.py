@@ -53,7 +53,7 @@ def _effects(found: Diagnosis):
 
 def _gap(found: Diagnosis):
     seen = found.examination
-    alone = "noise at most" if seen.at_most else "noise alone"
+    alone = "noise, guessed" if seen.guessed else "noise alone"
     made = table("Misfit (NRMSE)", "sensor", "nominal", "refitted", alone, "gap (noise = 1)", "refitted")
     for name in seen.before.nrmse:
         made.add_row(
