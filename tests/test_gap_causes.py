@@ -225,6 +225,8 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
 
 # effects asked again
 
+LOOKED, AGAIN = SimpleNamespace(clear=True), SimpleNamespace(clear=True)
+
 
 def explained(kind, place, evidence, effects):
     of = Hypothesis(tuple(Effect(k, tuple(p.items()), {}) for k, p in effects))
@@ -237,11 +239,13 @@ def two(monkeypatch):
     cubic, later = ("cubic_stiffness", B12), ("hysteresis", B23)
     selected = explained(*cubic, -500.0, [cubic]), explained(*later, 0.0, [cubic, later])
     rounds = ranking(-500.0, -600.0), ranking(0.0, kinds=[later])
-    at = _Found(BENCH, "looked", rounds, selected, selected[-1].refit)
+    at = _Found(BENCH, LOOKED, rounds, selected, selected[-1].refit)
     monkeypatch.setattr(module, "states_without", lambda found, row: ())
     monkeypatch.setattr(module, "changes_of", lambda found, bench: None)
-    monkeypatch.setattr(module, "_looked", lambda *_: "looked again")
-    monkeypatch.setattr(module, "_candidates", lambda look: (candidate("coulomb_friction", B23, force=1.0),))
+    monkeypatch.setattr(module, "looked", lambda *_: AGAIN)
+    monkeypatch.setattr(
+        module, "candidates_of", lambda look: (candidate("coulomb_friction", B23, force=1.0),)
+    )
     monkeypatch.setattr(module, "tied", lambda bench, found, **_: (bench, found))
     monkeypatch.setattr(module, "weighed_anew", lambda bench, found, **_: bench)
 
@@ -276,7 +280,7 @@ def test_an_effect_that_holds_beside_a_later_one_stays(two):
     found, asked = two((0.0, -20.0, -300.0))
     assert [x.kind for x in found.selected] == ["cubic_stiffness", "hysteresis"]
     assert len(asked) == 1
-    assert found.look == "looked"
+    assert found.look is LOOKED
     # its probability is that beside the later one
     assert found.selected[0].probability == pytest.approx(1 / (1 + math.exp(-20 / TEMPERATURE)), abs=1e-6)
     assert found.rounds[0].ranked[0].probability == found.selected[0].probability
@@ -287,7 +291,7 @@ def test_another_effect_takes_its_place(two):
     assert [x.kind for x in found.selected] == ["backlash", "hysteresis"]
     assert [len(x.refit.hypothesis.effects) for x in found.selected] == [1, 2]
     assert found.before is found.selected[-1].refit
-    assert found.look == "looked again"
+    assert found.look is AGAIN
     # then the later one is asked again beside it, next to what comes first and other laws of its place
     assert asked[1:] == [["hysteresis", "coulomb_friction", "coulomb_friction"]]
 

@@ -1,16 +1,13 @@
 """Why a model and records part: effects found one after another, how far the gap shrinks, and what is left."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
-from jaxsid.gap.deflate import deflated
-from jaxsid.gap.examine import NEGLIGIBLE, Examination
+from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
     ERRORS,
     FIRST,
@@ -22,17 +19,17 @@ from jaxsid.gap.explain import (
     elements_by_key,
     elsewhere,
     extended,
+    plainer,
     rank,
     rank_again,
 )
 from jaxsid.gap.hypothesis import FIXED
-from jaxsid.gap.locate import Scored, scored
+from jaxsid.gap.locate import Scored
+from jaxsid.gap.look import Look, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, quieter
-from jaxsid.gap.null import SIGNIFICANT, Null, null_test
-from jaxsid.gap.places import places_of
-from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of
-from jaxsid.gap.recalibrate import Recalibrated, recalibrated
+from jaxsid.gap.null import Null
+from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, notable, parsimonious
 from jaxsid.gap.refit import (
     Bench,
     Hypothesis,
@@ -44,9 +41,9 @@ from jaxsid.gap.refit import (
     tied,
     weighed_anew,
 )
-from jaxsid.gap.screen import Candidate, screen, unseen
+from jaxsid.gap.screen import Candidate, unseen
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.physical.elements import element_matrices, with_values
+from jaxsid.physical.elements import element_matrices
 from jaxsid.records import Record
 
 MOST_EFFECTS = 2
@@ -54,7 +51,6 @@ SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 WORTH = 6.0  # tempered gain of evidence from which on a further effect is taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
-PLACES = 4  # of one kind that are tried before other kinds, where something was found already
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
 LEAST = 0.01  # and of all that is left
 MOST_TURNS = 5  # of asking again
@@ -110,18 +106,6 @@ class Causes(NamedTuple):
         )
 
 
-class _Look(NamedTuple):
-    """What is left of records once effects found are taken out."""
-
-    fit: Recalibrated
-    null: Null
-    scored: Scored | None
-
-    @property
-    def clear(self) -> bool:
-        return bool(self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE)
-
-
 def causes_of(
     model: LumpedModel,
     seen: Sequence[Record],
@@ -143,7 +127,7 @@ def causes_of(
     say("kinds of effects")
     start = _Found(
         bench_of(model, seen, found.noises, found.fit),
-        _Look(found.fit, found.null, found.scored),
+        Look(found.fit, found.null, found.scored),
         (),
         (),
         None,
@@ -193,7 +177,7 @@ class _Found(NamedTuple):
     """How far the search has come: what is there, the rounds in which it was found, the fit; None before the first."""
 
     bench: Bench
-    look: _Look
+    look: Look
     rounds: tuple[Ranking, ...]
     selected: tuple[Explanation, ...]
     before: Refit | None
@@ -222,7 +206,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     steady = unseen(at.bench.model, at.look.scored.places)
     with_steady = _further(at, steady, FIRST, model, seen, say) if steady else at
     at = with_steady if with_steady.selected else at
-    origin, first = at, _candidates(at.look)
+    origin, first = at, candidates_of(at.look)
     begun = len(at.selected)
     most, candidates = MOST_EFFECTS + begun, first
     for effort in (FIRST, *[FURTHER] * MOST_EFFECTS):
@@ -246,10 +230,10 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
     return at
 
 
-def _further_candidates(look: _Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def _further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """What came next to the first effect, in turn with what now comes first."""
-    now = _varied(_candidates(look))
-    return tuple(c for three in zip(now[::2], now[1::2], _varied(first), strict=False) for c in three)
+    now = varied(candidates_of(look))
+    return tuple(c for three in zip(now[::2], now[1::2], varied(first), strict=False) for c in three)
 
 
 def _elsewhere(
@@ -265,8 +249,7 @@ def _elsewhere(
     anew = elsewhere(once, first, origin.before, FIRST, say)
     if anew is once:
         return at
-    at = origin.taken(anew)
-    at = at._replace(look=_looked(model, seen, at))
+    at = _left(origin.taken(anew), model, seen)
     if at.look.clear:
         return at
     return _further(at, _further_candidates(at.look, first), FURTHER, model, seen, say)
@@ -289,21 +272,9 @@ def _otherwise(
         return at
     say(f"{y.kind} in place of {best.kind}")
     others = tuple(x for x in ranking.ranked if x is not y)
-    other = origin.taken(ranking._replace(ranked=(y, *others)))
-    other = other._replace(look=_looked(model, seen, other))
+    other = _left(origin.taken(ranking._replace(ranked=(y, *others))), model, seen)
     further = _further(other, _further_candidates(other.look, first), FURTHER, model, seen, say)
     return further if len(further.selected) > len(at.selected) else at
-
-
-def _varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """The same, but those of a kind that has had its turn at several places come after all others."""
-    had: Counter[str] = Counter()
-    turns = []
-    for c in candidates:
-        had[c.kind] += 1
-        turns.append(had[c.kind] > PLACES)
-    order = sorted(range(len(candidates)), key=lambda i: turns[i])
-    return tuple(candidates[i] for i in order)
 
 
 def _further(
@@ -319,8 +290,22 @@ def _further(
     if not ranking.ranked or not _worth(ranking):
         return at.refused(ranking)
     say("what is left")
-    at = at.taken(ranking)
-    return at._replace(look=_looked(model, seen, at))
+    found = _left(at.taken(ranking), model, seen)
+    if found.look.clear:
+        return found
+    plain = plainer(ranking, at.before, effort, say)
+    if at.selected and not notable(plain):
+        return at.refused(ranking)
+    if plain.ranked[0].key == ranking.ranked[0].key:
+        return found._replace(rounds=(*found.rounds[:-1], plain))
+    say("what is left")
+    return _left(at.taken(plain), model, seen)
+
+
+def _left(at: _Found, model: LumpedModel, seen: Sequence[Record]) -> _Found:
+    """With a look at what is left."""
+    assert at.before is not None
+    return at._replace(look=looked(model, seen, at.bench, at.before))
 
 
 def _reconsidered(
@@ -341,7 +326,7 @@ def _reconsidered(
             # what has just come in has been compared; one alone has nothing beside it
             due = [x.key for x in at.selected if x.key in keys] if len(at.selected) > 1 else []
     same = [x.key for x in before] == [x.key for x in at.selected]
-    return at if same else at._replace(look=_looked(model, seen, at))
+    return at if same else _left(at, model, seen)
 
 
 def _turn(
@@ -354,10 +339,11 @@ def _turn(
     assert at.before is not None
     # what came next to it once, what comes first beside the others, and other laws of the place
     once = [again(y, y.refit) for y in at.rounds[i].ranked if y.key != x.key and y.left < FAR * x.left]
-    now = _candidates(_looked(model, seen, at._replace(before=without)))
+    now = candidates_of(looked(model, seen, at.bench, without))
     here = [c for c in now if key_of(x.kind, c.place) == x.key]
-    others = [*once[:AGAIN], *_varied(now)[:AGAIN], *here[:AGAIN]]
+    others = [*once[:AGAIN], *varied(now)[:AGAIN], *here[:AGAIN]]
     ranking = rank_again(at.bench._replace(states=states), at.before, x, others, without, FURTHER, say)
+    ranking = ranking if at.look.clear else parsimonious(ranking)
     rounds, selected = list(at.rounds), list(at.selected)
     if ranking.gain <= WORTH:
         del rounds[i], selected[i]
@@ -413,7 +399,7 @@ def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         at = at.taken(ranking)
     if begun and len(at.selected) > begun:
         say("what is left")
-        at = _reconsidered(at._replace(look=_looked(model, seen, at)), model, seen, say)
+        at = _reconsidered(_left(at, model, seen), model, seen, say)
     return at
 
 
@@ -448,46 +434,3 @@ def _worth(ranking: Ranking) -> bool:
     # of windows that lead to one another what is missed shows where they meet, too
     less = 2 * (best.evidence - without.evidence)
     return ranking.gain > WORTH and less > max(LESS * above, LEAST * without.squares)
-
-
-def _candidates(look: _Look) -> tuple[Candidate, ...]:
-    """From the longest record, and those that hold sensors which it lacks: programs are compiled for each length."""
-    if look.scored is None or look.clear:
-        return ()
-    of, rows = (
-        look.scored,
-        _telling([np.asarray(s.spectra.present) for s in look.scored.settings], look.scored),
-    )
-    motions = {
-        "force at the place": [of.found.explained[i].motion for i in rows],
-        "refitted model": [look.fit.linear[i].motion for i in rows],
-    }
-    left = [np.abs(np.asarray(look.fit.linear[i].left)) for i in rows]
-    return screen(of.model, [of.settings[i] for i in rows], of.places, motions, of.tolerance, left)
-
-
-def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:
-    """Numbers of the longest records that together hold all sensors, and of those as long as one of them."""
-    lengths = [s.spectra.samples for s in of.settings]
-    order = sorted(range(len(lengths)), key=lambda i: -lengths[i])
-    chosen, seen = [], np.zeros_like(present[0])
-    for i in order:
-        if (present[i] > seen).any():
-            chosen.append(i)
-            seen = np.maximum(seen, present[i])
-    return [i for i in range(len(lengths)) if lengths[i] in {lengths[j] for j in chosen}]
-
-
-def _looked(model: LumpedModel, seen: Sequence[Record], at: _Found) -> _Look:
-    """Records without what effects found do to them, beside the model with its wrong numbers put right."""
-    bench, before = at.bench, at.before
-    assert before is not None
-    nominal = np.asarray(element_matrices(bench.model).nominal)
-    change = np.zeros(len(nominal))
-    wrong = list(before.hypothesis.wrong)
-    change[wrong] = before.fit.theta[wrong]
-    base = with_values(bench.model, jnp.asarray(nominal * (1 + change)))
-    records = deflated(seen, bench, before)
-    fit = recalibrated(base, records, bench.noises, wide=True, given=True)
-    look = _Look(fit, null_test(fit, places_of(base)), None)
-    return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))

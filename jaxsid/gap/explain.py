@@ -20,9 +20,12 @@ from jaxsid.gap.ranking import (
     Ranking,
     Whole,
     density,
+    ends_of,
     gauge,
     key_of,
     left_in,
+    numbers_of,
+    parsimonious,
     ranked,
     value,
     volume,
@@ -49,6 +52,7 @@ ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be fou
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
 HERE = 3  # other laws that are tried where the best rough one acts
 ELSEWHERE = 3  # other places that the best law is fitted thoroughly at, where it leaves more than noise
+PLAINER = 2  # laws of fewer numbers that are tried where the best one acts and leaves more than noise
 HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
@@ -201,6 +205,48 @@ def elsewhere(
     every += [(y, y.refit, y.evidence + shift, y.left * louder) for y in ranking.ranked if y.key not in new]
     without = refitted(at, ranking.without.hypothesis, **_from(ranking.without, bench))
     return ranked(every, without, at, effort.temperature)
+
+
+def plainer(
+    ranking: Ranking,
+    before: Refit | None,
+    effort: Effort,
+    progress: Callable[[str], None] | None = None,
+) -> Ranking:
+    """A round whose best law leaves more than noise, next to laws of fewer numbers where it acts; see `parsimonious`.
+
+    Args:
+        ranking: the round.
+        before: what was found before.
+        effort: how much is fitted.
+        progress: called with a line of text before each fit.
+    """
+    best, say = ranking.ranked[0], progress or (lambda text: None)
+    bench, whole = ranking.bench._replace(jump=np.inf), len(ranking.bench.blocks)
+    fewer = [
+        y
+        for y in ranking.ranked[1:]
+        if ends_of(y.place) == ends_of(best.place)
+        and numbers_of(y.kind) < numbers_of(best.kind)
+        and math.isfinite(y.evidence)
+    ][:PLAINER]
+
+    def thorough(y: Explanation) -> Whole:
+        say(f"{y.kind} at {_label(y.place)}, thoroughly")
+        return _whole(bench, y.refit.hypothesis, {"changes": _changes(before, bench)}, effort)
+
+    due = [y for y in fewer if len(y.refit.fit.states) != whole]
+    new = dict(zip([y.key for y in due], side_by_side(thorough, due), strict=True))
+    every = []
+    for y in ranking.ranked:
+        w, at = new.get(y.key), ranking.bench
+        fitted = (
+            (y.refit, y.evidence, y.left)
+            if w is None
+            else (w.refit, density(*w) - volume(at), left_in(at, w))
+        )
+        every.append((y, *fitted))
+    return parsimonious(ranked(every, ranking.without, ranking.bench, ranking.temperature))
 
 
 def again(x: Explanation, found: Refit) -> Candidate:

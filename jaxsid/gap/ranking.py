@@ -6,11 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsid.gap.refit import Bench, Refit
+from jaxsid.gap.refit import Bench, Refit, as_guessed
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.lumped import GROUND
 
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
+PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
+NUMBER = 3.0  # log odds against each number of a law there
 Key = tuple[str, str, tuple[str, ...]]
 
 
@@ -80,6 +83,17 @@ def key_of(kind: str, place: Mapping[str, Any]) -> Key:
     return kind, where, named
 
 
+def ends_of(place: Mapping[str, Any]) -> tuple[str, ...]:
+    """Where a place acts, as one value: a body's motion is that against the ground, and the order of ends is none.
+
+    Args:
+        place: as of an `Effect`.
+    """
+    ((where, ends),) = place.items()
+    named = (GROUND, str(ends)) if where == "body" else (ends,) if isinstance(ends, str) else tuple(ends)
+    return ("between" if where == "body" else where, *sorted(named))
+
+
 class Whole(NamedTuple):
     """A fit to all records, and the bench of its own that it was fitted to."""
 
@@ -112,7 +126,7 @@ def gauge(bench: Bench) -> float:
     Args:
         bench: records and their noise.
     """
-    every = np.concatenate([np.log(w) for w in _weights(bench)])
+    every = np.concatenate([np.zeros(0), *(np.log(w) for w in _weights(bench))])
     return float(every.mean()) if every.size else 0.0
 
 
@@ -164,6 +178,64 @@ def left_in(bench: Bench, whole: Whole) -> float:
     """
     fit = whole.refit.fit
     return math.sqrt(fit.squares / max(fit.equations, 1)) * math.exp(gauge(bench) - gauge(whole.bench))
+
+
+def numbers_of(kind: str) -> int:
+    """How many numbers a kind of effect has.
+
+    Args:
+        kind: its name.
+    """
+    return len(CATALOGUE[kind].parameters)
+
+
+def parsimonious(ranking: Ranking) -> Ranking:
+    """A round whose laws at the place of the best one are compared by how much they leave: no noise, as tests tell.
+
+    Such a misfit says the same in every sample of a swing or a stroke, so that evidence, which counts samples, is as
+    good as certain of any difference. Counted as n pieces of misfit, log p = -n log(left above the noise) - c k for a
+    law of k numbers: one with more must leave clearly less. What has not been fitted to all records stays as it is.
+
+    Args:
+        ranking: the round.
+    """
+    whole, place = len(ranking.bench.blocks), ends_of(ranking.ranked[0].place)
+    here = [i for i, x in enumerate(ranking.ranked) if _comparable(x, place, whole)]
+    if len(here) < 2:
+        return ranking
+    own = [ranking.ranked[i] for i in here]
+    odds = np.array(
+        [-PIECES * math.log(_excess(ranking.bench, x.left)) - NUMBER * numbers_of(x.kind) for x in own]
+    )
+    best = own[int(odds.argmax())].refit.fit
+    unit = best.squares / max(best.equations, 1) * ranking.temperature
+    top = max(x.evidence for x in own)
+    values = dict(zip(here, top + unit * (odds - odds.max()), strict=True))
+    every = [(x, x.refit, values.get(i, x.evidence), x.left) for i, x in enumerate(ranking.ranked)]
+    return ranked(every, ranking.without, ranking.bench, ranking.temperature)
+
+
+def notable(ranking: Ranking) -> bool:
+    """Whether the best one leaves clearly less than there was without it, by the same count as `parsimonious`.
+
+    Args:
+        ranking: the round.
+    """
+    best, without = ranking.ranked[0], ranking.without.fit
+    before = math.sqrt(without.squares / max(without.equations, 1))
+    less = math.log(_excess(ranking.bench, before) / _excess(ranking.bench, best.left))
+    return PIECES * less > NUMBER * numbers_of(best.kind)
+
+
+def _comparable(x: Explanation, place: tuple[str, ...], whole: int) -> bool:
+    fitted = len(x.refit.fit.states) == whole and math.isfinite(x.evidence) and math.isfinite(x.left)
+    return fitted and ends_of(x.place) == place
+
+
+def _excess(bench: Bench, left: float) -> float:
+    """What is left above the noise, or above the least that it was guessed to be."""
+    floor = math.exp(gauge(bench) - gauge(as_guessed(bench)))
+    return math.sqrt(max(left**2 - floor**2, 1e-4 * left**2, np.finfo(float).tiny))
 
 
 def ranked(

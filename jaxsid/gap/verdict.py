@@ -1,7 +1,6 @@
 """What is concluded from explanations that were fitted: whether they explain enough, and which cannot be told apart."""
 
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +10,7 @@ from jaxsid.gap.closure import fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
-from jaxsid.gap.ranking import Explanation
-from jaxsid.mechanics.lumped import GROUND
+from jaxsid.gap.ranking import Explanation, ends_of
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
@@ -94,20 +92,13 @@ def _beside(causes: Causes) -> int:
     """How many of the first effects act elsewhere than what is left, and took away most of what was there."""
     if not causes.selected or causes.places is None:
         return 0
-    left_at = {_ends(p.as_dict()) for p in located(causes.places).likely}
+    left_at = {ends_of(p.as_dict()) for p in located(causes.places).likely}
     gap = causes.linear.after
     for count, (x, closure) in enumerate(zip(causes.selected, causes.closures, strict=True)):
-        if _ends(x.place) in left_at or fraction(gap, closure.after, closure.noise_floor) < MOST:
+        if ends_of(x.place) in left_at or fraction(gap, closure.after, closure.noise_floor) < MOST:
             return count
         gap = closure.after
     return len(causes.selected)
-
-
-def _ends(place: Mapping[str, Any]) -> tuple[str, ...]:
-    """A place as one value; a body's motion is that against the ground."""
-    ((where, ends),) = place.items()
-    named = (GROUND, str(ends)) if where == "body" else (ends,) if isinstance(ends, str) else tuple(ends)
-    return ("between" if where == "body" else where, *sorted(named))
 
 
 def _substantial(gap: float, floor: float) -> bool:

@@ -16,6 +16,11 @@ def _rate(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Arr
     return at.velocity - (beta * jnp.abs(at.velocity) * jnp.sign(at.memory) + gamma * at.velocity) * size
 
 
+def _sensible(stiffness: float, beta: float, gamma: float, exponent: float) -> bool:
+    # a loop that runs the other way round would feed the motion
+    return stiffness > 0
+
+
 EFFECT = Kind(
     name="hysteresis",
     where="between",
@@ -30,5 +35,6 @@ EFFECT = Kind(
     source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976).",
     force=_force,
     rate=_rate,
+    sensible=_sensible,
     states=1,
 )

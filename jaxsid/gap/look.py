@@ -1,0 +1,107 @@
+"""What is left of records once effects that were found are taken out, and what may be the matter with it."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsid.gap.deflate import deflated
+from jaxsid.gap.examine import NEGLIGIBLE
+from jaxsid.gap.locate import Scored, scored
+from jaxsid.gap.null import SIGNIFICANT, Null, null_test
+from jaxsid.gap.places import places_of
+from jaxsid.gap.recalibrate import Recalibrated, recalibrated
+from jaxsid.gap.refit import Bench, Refit
+from jaxsid.gap.screen import Candidate, screen
+from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.physical.elements import element_matrices, with_values
+from jaxsid.records import Record
+
+PLACES = 4  # of one kind that are tried before other kinds, where something was found already
+
+
+class Look(NamedTuple):
+    """What is left of records once effects found are taken out.
+
+    Attributes:
+        fit: the best linear model beside that.
+        null: tests of what it leaves.
+        scored: places where that may arise; None where tests find nothing, or nobody asked.
+    """
+
+    fit: Recalibrated
+    null: Null
+    scored: Scored | None
+
+    @property
+    def clear(self) -> bool:
+        return bool(self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE)
+
+
+def candidates_of(look: Look) -> tuple[Candidate, ...]:
+    """From the longest record, and those that hold sensors which it lacks: programs are compiled for each length.
+
+    Args:
+        look: none come of a clear one.
+    """
+    if look.scored is None or look.clear:
+        return ()
+    of, rows = (
+        look.scored,
+        _telling([np.asarray(s.spectra.present) for s in look.scored.settings], look.scored),
+    )
+    motions = {
+        "force at the place": [of.found.explained[i].motion for i in rows],
+        "refitted model": [look.fit.linear[i].motion for i in rows],
+    }
+    left = [np.abs(np.asarray(look.fit.linear[i].left)) for i in rows]
+    return screen(of.model, [of.settings[i] for i in rows], of.places, motions, of.tolerance, left)
+
+
+def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:
+    """Numbers of the longest records that together hold all sensors, and of those as long as one of them."""
+    lengths = [s.spectra.samples for s in of.settings]
+    order = sorted(range(len(lengths)), key=lambda i: -lengths[i])
+    chosen, seen = [], np.zeros_like(present[0])
+    for i in order:
+        if (present[i] > seen).any():
+            chosen.append(i)
+            seen = np.maximum(seen, present[i])
+    return [i for i in range(len(lengths)) if lengths[i] in {lengths[j] for j in chosen}]
+
+
+def varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The same, but those of a kind that has had its turn at several places come after all others.
+
+    Args:
+        candidates: most promising first.
+    """
+    had: Counter[str] = Counter()
+    turns = []
+    for c in candidates:
+        had[c.kind] += 1
+        turns.append(had[c.kind] > PLACES)
+    order = sorted(range(len(candidates)), key=lambda i: turns[i])
+    return tuple(candidates[i] for i in order)
+
+
+def looked(model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refit) -> Look:
+    """Records without what effects found do to them, beside the model with its wrong numbers put right.
+
+    Args:
+        model: nominal.
+        seen: records that may be looked at.
+        bench: that the fit is of.
+        found: the fit.
+    """
+    nominal = np.asarray(element_matrices(bench.model).nominal)
+    change = np.zeros(len(nominal))
+    wrong = list(found.hypothesis.wrong)
+    change[wrong] = found.fit.theta[wrong]
+    base = with_values(bench.model, jnp.asarray(nominal * (1 + change)))
+    records = deflated(seen, bench, found)
+    fit = recalibrated(base, records, bench.noises, wide=True, given=True)
+    look = Look(fit, null_test(fit, places_of(base)), None)
+    return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))
