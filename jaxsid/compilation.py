@@ -68,6 +68,9 @@ def keep_programs(folder: str | Path | None, *, hurry: bool = False) -> None:
     machines whose one device is a CPU. What else is compiled goes to JAX's own cache, in the same folder. Like
     every cache of executables it must be a folder that nobody else can write to.
 
+    Where XLA, as it loads them, warns of features such as `prefer-no-gather` that the machine lacks, these are
+    preferences, not instructions; TF_CPP_MIN_LOG_LEVEL=3 in the environment, as the command sets it, leaves that out.
+
     Args:
         folder: made when the first program is written. A folder that cannot be written to is no error.
         hurry: compile with few optimizations, in three quarters of the time, for programs that run only a few times.

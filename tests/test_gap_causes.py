@@ -23,7 +23,7 @@ from jaxsid.gap.explain import (
     extended,
 )
 from jaxsid.gap.fit import Fit
-from jaxsid.gap.noise import FINEST, noise_of, residual_noise
+from jaxsid.gap.noise import FINEST, Noise, noise_of, residual_noise
 from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, ranked
@@ -337,6 +337,16 @@ def test_none():
     assert sum(found.probability.values()) == pytest.approx(1)
     doubtful = verdict_of(examination(0.006, 0.6), None)
     assert 0.5 < doubtful.probability["none"] < 0.6
+
+
+def test_noise_that_was_guessed_is_a_bound_where_more_than_noise_is_left():
+    told = Noise(np.ones(3), np.ones((3, 1)), 500.0, "periods")
+    guess = Noise(told.level, told.taps, 0.0, "residual")
+    found = causes(ranking(0.0), closures=[closure(0.1)])
+    somewhere = SimpleNamespace()
+    assert found._replace(noises=(told, guess), places=somewhere).most == "at most "
+    assert found._replace(noises=(told, guess), places=None).most == ""
+    assert found._replace(noises=(told, told), places=somewhere).most == ""
 
 
 def test_what_is_far_above_the_noise_is_never_none(monkeypatch):

@@ -6,7 +6,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, record
 from scipy.signal import lfilter
 
 from jaxsid.checks import InputError
-from jaxsid.gap.noise import Noise, noise_of, period_of, quiet_part, quieter, residual_noise
+from jaxsid.gap.noise import Noise, no_louder, noise_of, period_of, quiet_part, quieter, residual_noise
 
 LEVEL = 0.05
 
@@ -68,6 +68,17 @@ def test_a_guess_is_no_more_than_what_is_left():
     assert (found.rms()[:2] <= np.minimum(guess.rms(), left.rms())[:2]).all()
     measured = Noise(guess.level, guess.taps, 500.0, "periods")
     np.testing.assert_array_equal(quieter(measured, left).level, guess.level)
+
+
+def test_noise_that_was_guessed_is_no_louder_than_what_is_left_of_other_samples():
+    taps = np.tile([1.0, -0.8], (3, 1))  # rms level / 0.6
+    left = np.column_stack([np.full(400, 0.3), np.full(400, 9.0), np.full(400, np.nan)])
+    left[::2, 0] = np.nan  # where nothing was measured
+    found = no_louder(Noise(np.array([0.6, 0.6, np.nan]), taps, 0.0, "residual"), left)
+    np.testing.assert_allclose(found.rms(), [0.3, 1.0, np.nan], rtol=1e-3)
+    np.testing.assert_array_equal(found.taps, taps)
+    measured = Noise(np.array([0.6, 0.6, np.nan]), taps, 500.0, "periods")
+    np.testing.assert_array_equal(no_louder(measured, left).level, measured.level)
 
 
 def test_lines_have_the_deviation_that_is_said():

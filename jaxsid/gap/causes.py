@@ -27,7 +27,7 @@ from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored
 from jaxsid.gap.look import Look, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
-from jaxsid.gap.noise import Noise, quieter
+from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null
 from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, notable, parsimonious
 from jaxsid.gap.refit import (
@@ -71,7 +71,8 @@ class Causes(NamedTuple):
         lefts: what each of these leaves of these samples.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
-        noises: of each record, what the chosen model leaves where tests find nothing in it, else no more than that.
+        noises: of each record; where it is guessed, what the chosen model leaves if tests find nothing in it, else no
+            more than that.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
     """
@@ -88,6 +89,11 @@ class Causes(NamedTuple):
     remaining: Null
     places: Scored | None
     before: tuple[Left, Left]
+
+    @property
+    def most(self) -> str:
+        """Words before a figure of the noise, where that is guessed and tests find more than noise in what is left."""
+        return "at most " if self.places is not None and any(n.degrees <= 0 for n in self.noises) else ""
 
     def first(self, count: int) -> "Causes":
         """The same with the first effects only; with the best linear model where there are none.
@@ -155,7 +161,8 @@ def causes_of(
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
     # what is left is noise where tests find nothing in it, else more than that
-    floor = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
+    told = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
+    floor = tuple(map(no_louder, told, steps[-1].left))
     *each, alone = (closure_of(*ends, x, floor, names) for x in (*steps, ends[1]))
     return Causes(
         rounds,

@@ -220,6 +220,23 @@ def quieter(guess: Noise, left: Noise) -> Noise:
     return Noise(level, np.where(less[:, None], left.taps, guess.taps), guess.degrees, guess.source)
 
 
+def no_louder(noise: Noise, left: Float[np.ndarray, "samples outputs"]) -> Noise:
+    """Each sensor's noise where all that tells of it is a guess: no more than a model leaves of other samples.
+
+    What disturbs the input, say, may be louder in one part of a record than in another.
+
+    Args:
+        noise: of a record; it stands where it is no guess.
+        left: of samples that the model was not fitted to; NaN where nothing was measured.
+    """
+    counts, squares = np.isfinite(left).sum(axis=0), np.nansum(left**2, axis=0)
+    least = np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.inf)
+    rms = noise.rms()
+    less = (noise.degrees <= 0) & (least < rms)
+    level = np.where(less, noise.level * least / np.where(less, rms, 1.0), noise.level)
+    return Noise(level, noise.taps, noise.degrees, noise.source)
+
+
 def floor(spectra: Spectra) -> Noise:
     """White noise of the level of the quietest band of what a model leaves.
 

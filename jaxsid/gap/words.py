@@ -87,7 +87,7 @@ def summary(found: Found) -> tuple[str, str]:
     closure = causes.closures[-1]
     shrinks = (
         f"On samples that were not used the gap falls from {percent(closure.before)} to {percent(closure.after)}; "
-        f"noise alone leaves {percent(closure.noise_floor)}."
+        f"noise alone leaves {causes.most}{percent(closure.noise_floor)}."
     )
     if found.verdict == "unknown":
         likely = found.examination.locations
@@ -139,7 +139,7 @@ def remaining(found: Found) -> str:
     band = _loudest(gap)
     return (
         f"What remains: {percent(closure.by_sensor[worst])} of {worst}, where noise alone leaves "
-        f"{percent(closure.noise_by_sensor[worst])}; the linear model misses most at {band}."
+        f"{causes.most}{percent(closure.noise_by_sensor[worst])}; the linear model misses most at {band}."
     )
 
 

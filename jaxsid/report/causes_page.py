@@ -57,9 +57,13 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
             misfit(closure.after),
             f"{chosen_name(found)}: {percent(closure.fraction)} of it explained",
         ),
-        Card("Noise alone", percent(closure.noise_floor), "as small as a gap can be"),
+        Card("Noise alone", f"{_most(found)}{percent(closure.noise_floor)}", "as small as a gap can be"),
         Card("Probability", share_of(chance_of), remark),
     )
+
+
+def _most(found: Diagnosis) -> str:
+    return "" if found.causes is None else found.causes.most
 
 
 def which_section(found: Diagnosis) -> Section:
@@ -210,7 +214,8 @@ def closure_section(found: Diagnosis) -> Section:
     for i, (x, step) in enumerate(zip(causes.selected, causes.closures, strict=False)):
         said = Cell(f"{'with' if i == 0 else 'and'} {kind_words(x.kind)}", place_words(x.place))
         rows.append(_closure_row(said, step.after, step.by_sensor, names))
-    rows.append(_closure_row("noise alone", closure.noise_floor, closure.noise_by_sensor, names))
+    floor = f"noise alone, {causes.most}".rstrip(", ")
+    rows.append(_closure_row(floor, closure.noise_floor, closure.noise_by_sensor, names))
     low, high = closure.ci95
     note = (
         f"NRMSE on the last {percent(HELD_OUT)} of every record. Of the nominal model's gap above the noise "
@@ -218,7 +223,7 @@ def closure_section(found: Diagnosis) -> Section:
         "Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
         "before, a after and n the noise."
     )
-    if causes.noises is not found.examination.noises and causes.places is None:
+    if causes.places is None and any(n.degrees <= 0 for n in causes.noises):
         note += " The noise is that which the chosen model leaves of the other samples, where tests find nothing in it."
     table = Table(("Model", "All sensors", *names), tuple(rows), "", note)
     return Section("How far it shrinks", (table,))
