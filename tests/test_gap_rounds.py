@@ -10,7 +10,7 @@ from jaxsid.gap import causes, explain
 from jaxsid.gap import ranking as ranking_of
 from jaxsid.gap.causes import _Found, _otherwise
 from jaxsid.gap.explain import HERE, TEMPERATURE, _roughly, extended
-from jaxsid.gap.ranking import NUMBER, PIECES, Whole, ends_of, notable, parsimonious, ranked
+from jaxsid.gap.ranking import LOUD, NUMBER, PIECES, Whole, ends_of, notable, parsimonious, ranked
 from jaxsid.gap.refit import Hypothesis
 
 B13 = {"between": ("b1", "b3")}
@@ -224,6 +224,13 @@ def test_laws_elsewhere_keep_their_evidence():
 def test_a_law_alone_at_its_place_stays():
     first = misfit((*STRIBECK, 11.5), ("coulomb_friction", B23, -5.0, 12.0))
     assert parsimonious(first) is first
+
+
+def test_laws_that_leave_noise_are_compared_by_evidence():
+    first = misfit((*STRIBECK, 0.9 * LOUD), (*COULOMB, 0.95 * LOUD))
+    assert parsimonious(first) is first
+    assert explain.plainer(first, None, explain.FIRST) is first
+    assert notable(misfit(("cogging_ripple", B12, 0.0, 0.9 * LOUD), without=0.91 * LOUD))
 
 
 def test_a_further_law_must_leave_clearly_less_than_there_was():

@@ -24,6 +24,7 @@ from jaxsid.gap.ranking import (
     gauge,
     key_of,
     left_in,
+    loud,
     numbers_of,
     parsimonious,
     ranked,
@@ -213,7 +214,7 @@ def plainer(
     effort: Effort,
     progress: Callable[[str], None] | None = None,
 ) -> Ranking:
-    """A round whose best law leaves more than noise, next to laws of fewer numbers where it acts; see `parsimonious`.
+    """A round whose best law is loud, next to laws of fewer numbers where it acts; see `parsimonious`.
 
     Args:
         ranking: the round.
@@ -221,6 +222,8 @@ def plainer(
         effort: how much is fitted.
         progress: called with a line of text before each fit.
     """
+    if not loud(ranking):
+        return ranking
     best, say = ranking.ranked[0], progress or (lambda text: None)
     bench, whole = ranking.bench._replace(jump=np.inf), len(ranking.bench.blocks)
     fewer = [

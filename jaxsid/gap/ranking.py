@@ -12,6 +12,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND
 
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
+LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
 Key = tuple[str, str, tuple[str, ...]]
@@ -189,8 +190,17 @@ def numbers_of(kind: str) -> int:
     return len(CATALOGUE[kind].parameters)
 
 
+def loud(ranking: Ranking) -> bool:
+    """Whether even the best one leaves far more than noise, or than the least that was guessed.
+
+    Args:
+        ranking: the round.
+    """
+    return bool(ranking.ranked) and ranking.ranked[0].left > LOUD * _floor(ranking.bench)
+
+
 def parsimonious(ranking: Ranking) -> Ranking:
-    """A round whose laws at the place of the best one are compared by how much they leave: no noise, as tests tell.
+    """A round whose laws at the place of the best one are compared by how much they leave, where that is loud.
 
     Such a misfit says the same in every sample of a swing or a stroke, so that evidence, which counts samples, is as
     good as certain of any difference. Counted as n pieces of misfit, log p = -n log(left above the noise) - c k for a
@@ -199,6 +209,8 @@ def parsimonious(ranking: Ranking) -> Ranking:
     Args:
         ranking: the round.
     """
+    if not loud(ranking):
+        return ranking
     whole, place = len(ranking.bench.blocks), ends_of(ranking.ranked[0].place)
     here = [i for i, x in enumerate(ranking.ranked) if _comparable(x, place, whole)]
     if len(here) < 2:
@@ -216,7 +228,7 @@ def parsimonious(ranking: Ranking) -> Ranking:
 
 
 def notable(ranking: Ranking) -> bool:
-    """Whether the best one leaves clearly less than there was without it, by the same count as `parsimonious`.
+    """Whether the best one leaves noise, or clearly less than there was without it, by the count of `parsimonious`.
 
     Args:
         ranking: the round.
@@ -224,7 +236,7 @@ def notable(ranking: Ranking) -> bool:
     best, without = ranking.ranked[0], ranking.without.fit
     before = math.sqrt(without.squares / max(without.equations, 1))
     less = math.log(_excess(ranking.bench, before) / _excess(ranking.bench, best.left))
-    return PIECES * less > NUMBER * numbers_of(best.kind)
+    return not loud(ranking) or PIECES * less > NUMBER * numbers_of(best.kind)
 
 
 def _comparable(x: Explanation, place: tuple[str, ...], whole: int) -> bool:
@@ -232,10 +244,14 @@ def _comparable(x: Explanation, place: tuple[str, ...], whole: int) -> bool:
     return fitted and ends_of(x.place) == place
 
 
+def _floor(bench: Bench) -> float:
+    """The noise, or the least that it was guessed to be, in that of a bench."""
+    return math.exp(gauge(bench) - gauge(as_guessed(bench)))
+
+
 def _excess(bench: Bench, left: float) -> float:
-    """What is left above the noise, or above the least that it was guessed to be."""
-    floor = math.exp(gauge(bench) - gauge(as_guessed(bench)))
-    return math.sqrt(max(left**2 - floor**2, 1e-4 * left**2, np.finfo(float).tiny))
+    """What is left above the noise."""
+    return math.sqrt(max(left**2 - _floor(bench) ** 2, 1e-4 * left**2, np.finfo(float).tiny))
 
 
 def ranked(

@@ -10,13 +10,12 @@ from jaxsid.gap.closure import fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
-from jaxsid.gap.ranking import Explanation, ends_of
+from jaxsid.gap.ranking import LOUD, Explanation, ends_of
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
 MORE = 0.7  # likewise, where much more than noise is left
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
-LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
