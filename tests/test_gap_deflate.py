@@ -57,3 +57,18 @@ def test_nothing_is_taken_out_of_a_record_without_effects():
     given = record(drive(), y)
     (same,) = deflated([given], of, refitted(of, Hypothesis()))
     assert same is given
+
+
+def test_windows_stand_in_for_a_run_that_grows_without_bound(monkeypatch):
+    u = drive()
+    measured, level = colored(truth(u, "cubic_stiffness", JOINT, {"coefficient": 1e6}), 3)
+    of = bench(measured, level)
+    found = refitted(of, Hypothesis((CUBIC,)))
+    given = [record(u, measured)]
+    monkeypatch.setattr(module, "_followed", lambda bench: False)
+    monkeypatch.setattr(module, "_run", lambda *_: [np.full_like(s, np.inf) for s in found.fit.states])
+    (left,) = deflated(given, of, found)
+    monkeypatch.setattr(module, "_followed", lambda bench: True)
+    (followed,) = deflated(given, of, found)
+    assert np.isfinite(np.asarray(left.y)).all()
+    np.testing.assert_array_equal(left.y, followed.y)

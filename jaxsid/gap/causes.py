@@ -346,7 +346,9 @@ def _turn(
     assert at.before is not None
     # what came next to it once, what comes first beside the others, and other laws of the place
     once = [again(y, y.refit) for y in at.rounds[i].ranked if y.key != x.key and y.left < FAR * x.left]
-    now = candidates_of(looked(model, seen, at.bench, without))
+    # where nothing holds the motion without it there is nothing to look at
+    told = np.isfinite(without.fit.evidence)
+    now = candidates_of(looked(model, seen, at.bench, without)) if told else ()
     here = [c for c in now if key_of(x.kind, c.place) == x.key]
     others = [*once[:AGAIN], *varied(now)[:AGAIN], *here[:AGAIN]]
     ranking = rank_again(at.bench._replace(states=states), at.before, x, others, without, FURTHER, say)

@@ -6,7 +6,8 @@ readings is how a window that begins at x differs from one of the linear model t
 every step of a simulation, not only where there are samples.
 
 Windows of a fit that lead to one another follow what was measured, so that no small error leads astray. Windows that
-stand alone know their motion from a few samples each; a free run knows it better, unless it drifts away.
+stand alone know their motion from a few samples each; a free run knows it better, unless it drifts away, or grows
+without bound, as it may with a law that holds within windows.
 """
 
 from collections.abc import Sequence
@@ -34,17 +35,26 @@ def deflated(records: Sequence[Record], bench: Bench, found: Refit) -> list[Reco
     """
     if not found.hypothesis.effects:
         return list(records)
+    begun = found.fit.states if _followed(bench) else _run(records, bench, found)
+    changes = _changes(bench, found, begun)
+    if not all(np.isfinite(x).all() for x in changes):
+        changes = _changes(bench, found, found.fit.states)
+    return [_less(record, i, bench, changes) for i, record in enumerate(records)]
+
+
+def _changes(
+    bench: Bench, found: Refit, begun: Sequence[Float[np.ndarray, "windows n"]]
+) -> list[Float[np.ndarray, "windows length outputs"]]:
+    """What effects do to the readings of every window, whose states are given where it begins."""
     size = 2 * len(bench.model.bodies)
     plain, theta = _linear(found, bench)
     own = ((0, 0), (0, 2 * plain.slots.count))
-    begun = found.fit.states if _followed(bench) else _run(records, bench, found)
     within = products_of(found.shot, bench.blocks, found.fit.theta, begun, bench.substeps)
     states = [np.pad(s[:, :size], own) for s in begun]
     shares = _shares(bench, within, products_of(plain, bench.blocks, theta, states, 1), size)
     rest = [s - np.pad(c, own) for s, c in zip(states, shares, strict=True)]
     without = products_of(plain, bench.blocks, theta, rest, 1)
-    changes = [np.asarray(x.left) - np.asarray(y.left) for x, y in zip(within, without, strict=True)]
-    return [_less(record, i, bench, changes) for i, record in enumerate(records)]
+    return [np.asarray(x.left) - np.asarray(y.left) for x, y in zip(within, without, strict=True)]
 
 
 def _followed(bench: Bench) -> bool:
