@@ -280,3 +280,46 @@ def test_laws_of_fewer_numbers_are_fitted_to_all_records(simpler):
 def test_the_best_law_stays_where_simpler_ones_leave_much_more(simpler):
     found, _ = simpler({"quadratic_damping": 30.0, "coulomb_friction": 25.0})
     assert found.ranked[0].kind == "stribeck_friction"
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """What is taken of a round that Stribeck's law won, where more is left and simpler laws are as told."""
+
+    def run(plain, clear=False, selected=()):
+        first = misfit((*STRIBECK, 11.5))
+        look = SimpleNamespace(clear=clear)
+
+        def take(self, of):
+            best = of.ranked[0]
+            return self._replace(rounds=(of,), selected=(*self.selected, best), before=best.refit)
+
+        monkeypatch.setattr(_Found, "taken", take)
+        monkeypatch.setattr(causes, "looked", lambda *_: look)
+        monkeypatch.setattr(causes, "rank", lambda *_: first)
+        monkeypatch.setattr(causes, "_worth", lambda of: True)
+        monkeypatch.setattr(causes, "plainer", lambda *_: plain)
+        at = _Found(BENCH, look, (), selected, refit(0.0) if selected else None)
+        return at, causes._further(at, (), explain.FIRST, BENCH.model, (), silent)
+
+    return run
+
+
+def test_the_simpler_law_is_taken_in_place_of_the_best_one(taken):
+    plain = misfit(("coulomb_friction", B12, 0.0, 12.0), (*STRIBECK, 11.5))
+    assert [x.kind for x in taken(plain)[1].selected] == ["coulomb_friction"]
+    assert [x.kind for x in taken(plain, clear=True)[1].selected] == ["stribeck_friction"]
+
+
+def test_the_best_law_has_its_probability_beside_simpler_ones(taken):
+    plain = misfit((*STRIBECK, 6.0), ("coulomb_friction", B12, -1.0, 12.0))
+    _, found = taken(plain)
+    assert found.rounds == (plain,)
+    assert found.selected[0].probability == plain.ranked[0].probability < 1
+
+
+def test_a_further_law_that_leaves_hardly_less_is_refused(taken):
+    known = misfit(("constant_load", B12, 0.0, 20.0)).ranked
+    at, found = taken(misfit((*STRIBECK, 90.0)), selected=known)
+    assert found.selected == at.selected
+    assert len(taken(misfit((*STRIBECK, 30.0)), selected=known)[1].selected) == 2

@@ -304,7 +304,8 @@ def _further(
     if at.selected and not notable(plain):
         return at.refused(ranking)
     if plain.ranked[0].key == ranking.ranked[0].key:
-        return found._replace(rounds=(*found.rounds[:-1], plain))
+        last = found.selected[-1]._replace(probability=plain.ranked[0].probability)
+        return found._replace(rounds=(*found.rounds[:-1], plain), selected=(*found.selected[:-1], last))
     say("what is left")
     return _left(at.taken(plain), model, seen)
 
