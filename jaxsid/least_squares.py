@@ -8,6 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 RELATIVE = 1e-12  # of J'J's largest diagonal entry: the least, where `through` makes others vanish
+PROMISE = (
+    1e-3  # of what a last step may bring: where the next one promises less, it is not worth an evaluation
+)
+LIGHT = (
+    0.01  # damping up to which a step is nearly that of Gauss and Newton, so that its promise means something
+)
 
 
 class Minimum(NamedTuple):
@@ -79,7 +85,8 @@ def levenberg_marquardt(
             three sums over them that are needed.
         start: (n,).
         max_steps: most evaluations.
-        tolerance: stop when a helpful step lowers the cost by less than this part.
+        tolerance: stop when a helpful step lowers the cost by less than this part, or the next one promises to lower
+            it by far less.
         through: the unknowns are put through this map before `evaluate` sees them. Its curvature is taken into
             account, as a map that keeps to a set of allowed values needs where the best ones lie on the edge.
 
@@ -109,6 +116,8 @@ def levenberg_marquardt(
         damping = jnp.where(first, state.damping, damping)
         growth = jnp.where(better, 2.0, 2 * state.growth)
         candidate, promised = _step(through, value, product, gradient, damping)
+        hopeless = (promised < PROMISE * tolerance * cost) & (damping < LIGHT)
+        finished = finished | (better & hopeless)
         return _State(
             value, cost, product, gradient, candidate, promised, damping, growth, state.steps + 1, finished
         )

@@ -130,3 +130,17 @@ def test_single_precision(single_precision):
     found = levenberg_marquardt(forward(rosenbrock), jnp.array([-1.2, 1.0]), max_steps=200)
     assert found.value.dtype == jnp.float32
     np.testing.assert_allclose(found.value, [1.0, 1.0], rtol=1e-3)
+
+
+def test_a_step_that_promises_nothing_is_not_evaluated():
+    asked = 1e-8
+    found = fit(Y, tolerance=asked)
+    again = fit(Y, start=found.value, tolerance=asked)
+    assert int(again.steps) == 1
+    np.testing.assert_array_equal(again.value, found.value)
+    # what was left out is worth less than a hundred millionth of the cost
+    exact = optimize.least_squares(
+        lambda x: np.asarray(decay(x, T, Y)), START, xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    assert abs(float(found.cost) / exact.cost - 1) < asked
+    assert int(found.steps) < int(fit(Y, tolerance=0.0).steps)

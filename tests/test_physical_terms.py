@@ -96,3 +96,15 @@ def test_coloured_noise_is_made_white():
         for i in range(2)
     )
     close(r @ r, squares, 1e-6)
+
+
+@pytest.mark.parametrize("samples", [60, 59, 2])
+def test_the_sums_of_a_response_are_those_of_its_rows(samples):
+    ir = exact_response(MODEL, samples)
+    rng = np.random.default_rng(1)
+    term = response_term(ir, SENSED, Weights(jnp.asarray(rng.uniform(0, 2, ir.h.shape)), None))
+    r, j = evaluated(term)
+    half, product, gradient = term.sums(UNKNOWNS.matrices(THETA), UNKNOWNS.slopes)
+    close(half, 0.5 * r @ r)
+    close(product, j.T @ j)
+    close(gradient, j.T @ r, 1e-8)

@@ -14,7 +14,6 @@ from jaxsid.compilation import compiled
 from jaxsid.least_squares import levenberg_marquardt
 from jaxsid.physical.elements import LinearMatrices
 from jaxsid.physical.interior import FALL, GAP, STAGES, STEPS, Cone, Edge, barrier, edge, inside
-from jaxsid.physical.parameterization import Parameterization
 from jaxsid.physical.posterior import (
     Data,
     Posterior,
@@ -174,7 +173,7 @@ def _central(
 @compiled
 def _bounded(
     terms: tuple[Data, ...],
-    parameterization: Parameterization,
+    unknowns: LinearMatrices,
     prior: Prior,
     start: Array,
     lower: Array,
@@ -186,7 +185,7 @@ def _bounded(
     equations = jnp.maximum(count(terms), 1)
 
     def cost(theta: Array) -> tuple[Array, Array]:
-        squares, _, gradient = with_prior(sums(terms, parameterization, theta), prior, theta)
+        squares, _, gradient = with_prior(sums(terms, unknowns, theta), prior, theta)
         return 0.5 * squares / equations, gradient / equations
 
     solver = jaxopt.LBFGSB(cost, value_and_grad=True, maxiter=SEARCHES, tol=1e-9)

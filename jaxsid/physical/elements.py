@@ -16,7 +16,7 @@ from jaxsid.mechanics.lumped import (
     lumped_model,
     second_order,
 )
-from jaxsid.physical.parameterization import BLIND, Matrix, Triple
+from jaxsid.physical.parameterization import BLIND, Matrix, Slopes, Triple
 from jaxsid.records import as_array
 
 QUANTITIES = ("mass", "damping", "stiffness")
@@ -84,6 +84,13 @@ class LinearMatrices(eqx.Module):
         """M, D, K."""
         values = self.values(theta)
         M, D, K = (jnp.einsum("e,eij->ij", values, jnp.asarray(x)) for x in self.directions)
+        return M, D, K
+
+    @property
+    def slopes(self) -> Slopes:
+        """(p, N, N) changes of M, D, K with each unknown."""
+        mix = jnp.asarray(self.mix) * self.scale
+        M, D, K = (jnp.einsum("ep,eij->pij", mix, jnp.asarray(x)) for x in self.directions)
         return M, D, K
 
     def values(self, theta: Array) -> Float[Array, " e"]:

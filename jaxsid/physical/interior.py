@@ -130,16 +130,12 @@ def barrier(
         theta: (p,).
         lower, upper: (p,) bounds, infinite where there are none.
     """
-    mix = jnp.asarray(unknowns.mix) * unknowns.scale
     low, high = theta - lower, upper - theta
     value = -jnp.where(jnp.isfinite(low), jnp.log(low), 0.0).sum()
     value -= jnp.where(jnp.isfinite(high), jnp.log(high), 0.0).sum()
     slope = -1 / low + 1 / high
     second = jnp.diag(1 / low**2 + 1 / high**2)
-    for matrix, directions, basis in zip(
-        unknowns.matrices(theta), unknowns.directions, cone.bases, strict=True
-    ):
-        change = jnp.einsum("ep,eij->pij", mix, jnp.asarray(directions))
+    for matrix, change, basis in zip(unknowns.matrices(theta), unknowns.slopes, cone.bases, strict=True):
         inner, along = basis.T @ matrix @ basis, basis.T @ change @ basis
         root = jnp.linalg.cholesky(inner)  # NaN where it is not positive, which no step is accepted with
         half = jax.vmap(lambda x, root=root: jax.scipy.linalg.solve_triangular(root, x, lower=True))

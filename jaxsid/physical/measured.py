@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxsid.checks import is_concrete, require, require_finite
 from jaxsid.impulse.spectra import FrequencyResponse
 from jaxsid.mechanics.hold import check_holds
-from jaxsid.physical.terms import FrequencyTerm, ResponseTerm
+from jaxsid.physical.terms import FrequencyTerm, ResponseTerm, in_blocks
 from jaxsid.records import ImpulseResponse, SecondOrderModel, as_array
 
 HELD_OUT = 4  # every fourth sample or line is kept for validation
@@ -36,7 +36,8 @@ def response_term(
     # a part of the samples is weighed as if its noise were white, which costs that fit precision but no truth
     weight = weights.weight if used is None else weights.weight * jnp.asarray(used)[:, None, None]
     ramps = tuple(h == "first" for h in ir.hold)
-    return ResponseTerm(ir.h, weight, weights.whitener if used is None else None, ir.dt, sensed, ramps)
+    whitener = weights.whitener if used is None else None
+    return ResponseTerm(ir.h, weight, (in_blocks(ir.h), in_blocks(weight)), whitener, ir.dt, sensed, ramps)
 
 
 def check_response(ir: ImpulseResponse, outputs: int, inputs: int) -> None:

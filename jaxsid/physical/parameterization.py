@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 BLIND = 1e-10  # of the largest eigenvalue of scaled J'J: nothing is known of that combination of unknowns
 Matrix = Array | np.ndarray
 Triple = tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]
+Slopes = tuple[Float[Array, "p N N"], Float[Array, "p N N"], Float[Array, "p N N"]]
 
 
 @runtime_checkable

@@ -16,7 +16,6 @@ from jaxsid.compilation import compiled
 from jaxsid.least_squares import levenberg_marquardt, sums_of
 from jaxsid.physical.elements import LinearMatrices
 from jaxsid.physical.motion import MotionTerm
-from jaxsid.physical.parameterization import Parameterization
 from jaxsid.physical.restrictions import Prior
 from jaxsid.physical.terms import Term
 
@@ -56,24 +55,21 @@ class Sums(NamedTuple):
     gradient: Array
 
 
-def sums(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> Sums:
+def sums(terms: tuple[Data, ...], unknowns: LinearMatrices, theta: Array) -> Sums:
     """Of the weighted residual.
 
     Args:
         terms: the data.
-        parameterization: what the unknowns mean.
-        theta: (p,) unknowns.
+        unknowns: what theta means.
+        theta: (p,).
     """
     parts = []
-    if any(isinstance(term, Term) for term in terms):
-        matrices = parameterization.matrices(theta)
-        M, D, K = (jnp.moveaxis(x, -1, 0) for x in jax.jacfwd(parameterization.matrices)(theta))
-        parts += [sums_of(*term.evaluate(matrices, (M, D, K))) for term in terms if isinstance(term, Term)]
     for term in terms:
         if isinstance(term, MotionTerm):
-            assert isinstance(parameterization, LinearMatrices)
-            r, j = term.projected(parameterization, theta)
+            r, j = term.projected(unknowns, theta)
             parts.append(sums_of(r.ravel(), j.reshape(-1, len(theta))))
+        else:
+            parts.append(term.sums(unknowns.matrices(theta), unknowns.slopes))
     cost, product, gradient = (jnp.stack(x).sum(axis=0) for x in zip(*parts, strict=True))
     return Sums(2 * cost, product, gradient)
 
@@ -93,7 +89,7 @@ def with_prior(found: Sums, prior: Prior, theta: Array) -> tuple[Array, Array, A
 @compiled
 def most_probable(
     terms: tuple[Data, ...],
-    parameterization: Parameterization,
+    unknowns: LinearMatrices,
     prior: Prior,
     start: Float[Array, " p"],
     solver: Solver | None = None,
@@ -102,16 +98,16 @@ def most_probable(
 
     Args:
         terms: the data.
-        parameterization: what may vary.
+        unknowns: what may vary.
         prior: of the unknowns.
         start: (p,) unknowns to begin with.
         solver: of optimistix; None for `levenberg_marquardt`.
     """
     if solver is not None:
-        return _by_optimistix(terms, parameterization, prior, start, solver)
+        return _by_optimistix(terms, unknowns, prior, start, solver)
 
     def evaluate(theta: Array) -> tuple[Array, Array, Array]:
-        squares, product, gradient = with_prior(sums(terms, parameterization, theta), prior, theta)
+        squares, product, gradient = with_prior(sums(terms, unknowns, theta), prior, theta)
         return 0.5 * squares, product, gradient
 
     found = levenberg_marquardt(evaluate, start, max_steps=STEPS, tolerance=GAIN)
@@ -137,12 +133,12 @@ def count(terms: tuple[Data, ...]) -> Array:
 
 
 def _by_optimistix(
-    terms: tuple[Data, ...], parameterization: Parameterization, prior: Prior, start: Array, solver: Solver
+    terms: tuple[Data, ...], unknowns: LinearMatrices, prior: Prior, start: Array, solver: Solver
 ) -> Posterior:
     """The same by a solver of optimistix, to which all equations are p + 1 with the same squares and slopes."""
 
     def both(theta: Array) -> tuple[Array, Array]:
-        return _factored(*with_prior(sums(terms, parameterization, theta), prior, theta))
+        return _factored(*with_prior(sums(terms, unknowns, theta), prior, theta))
 
     @jax.custom_jvp
     def residual(theta: Array) -> Array:
@@ -157,12 +153,12 @@ def _by_optimistix(
         lambda theta, _: residual(theta), solver, start, max_steps=STEPS, throw=False
     )
     steps, converged = jnp.asarray(found.stats["num_steps"]), found.result == optimistix.RESULTS.successful
-    return posterior_at(terms, parameterization, prior, found.value, steps, converged)
+    return posterior_at(terms, unknowns, prior, found.value, steps, converged)
 
 
 def posterior_at(
     terms: tuple[Data, ...],
-    parameterization: Parameterization,
+    unknowns: LinearMatrices,
     prior: Prior,
     theta: Array,
     steps: Array,
@@ -172,12 +168,12 @@ def posterior_at(
 
     Args:
         terms: the data.
-        parameterization: what the unknowns mean.
+        unknowns: what theta means.
         prior: of the unknowns.
         theta: (p,) unknowns.
         steps, converged: of the search.
     """
-    found = sums(terms, parameterization, theta)
+    found = sums(terms, unknowns, theta)
     _, _, gradient = with_prior(found, prior, theta)
     return Posterior(theta, found.squares, count(terms), found.product, gradient, steps, converged)
 
@@ -202,7 +198,7 @@ def _factored(squares: Array, product: Array, gradient: Array) -> tuple[Array, A
 @compiled
 def from_each(
     terms: tuple[Data, ...],
-    parameterization: Parameterization,
+    unknowns: LinearMatrices,
     prior: Prior,
     starts: Float[Array, "starts p"],
     solver: Solver | None = None,
@@ -211,38 +207,36 @@ def from_each(
 
     Args:
         terms: the data.
-        parameterization: what may vary.
+        unknowns: what may vary.
         prior: of the unknowns.
         starts: unknowns to begin with.
         solver: of optimistix; None for `levenberg_marquardt`.
     """
-    one = lambda start: most_probable(terms, parameterization, prior, start, solver)  # noqa: E731
+    one = lambda start: most_probable(terms, unknowns, prior, start, solver)  # noqa: E731
     together = all(isinstance(term, Term) for term in terms)
     return jax.vmap(one)(starts) if together else jax.lax.map(one, starts)
 
 
 @compiled
-def squares_at(terms: tuple[Data, ...], parameterization: Parameterization, theta: Array) -> Array:
+def squares_at(terms: tuple[Data, ...], unknowns: LinearMatrices, theta: Array) -> Array:
     """Sum of the squares of the data's weighted residual.
 
     Args:
         terms: the data.
-        parameterization: what the unknowns mean.
+        unknowns: what theta means.
         theta: unknowns.
     """
-    return sums(terms, parameterization, theta).squares
+    return sums(terms, unknowns, theta).squares
 
 
 @compiled
-def gradient_at(
-    terms: tuple[Data, ...], parameterization: Parameterization, prior: Prior, theta: Array
-) -> Array:
+def gradient_at(terms: tuple[Data, ...], unknowns: LinearMatrices, prior: Prior, theta: Array) -> Array:
     """Slope of half the sum of squares of data and prior.
 
     Args:
         terms: the data.
-        parameterization: what the unknowns mean.
+        unknowns: what theta means.
         prior: of the unknowns.
         theta: unknowns.
     """
-    return with_prior(sums(terms, parameterization, theta), prior, theta)[2]
+    return with_prior(sums(terms, unknowns, theta), prior, theta)[2]

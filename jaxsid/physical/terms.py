@@ -11,14 +11,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from jaxsid.least_squares import Sums, sums_of
 from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
 from jaxsid.mechanics.inverses import inverse_each
 from jaxsid.physical.inband_fit import Target, line_residual
-from jaxsid.physical.parameterization import Triple
+from jaxsid.physical.parameterization import Slopes, Triple
 from jaxsid.records import SecondOrderModel
 
 Stack = Float[Array, "_ _ _"]  # (1 + p, rows, columns): a matrix, then its change in each direction
-Slopes = tuple[Float[Array, "p N N"], Float[Array, "p N N"], Float[Array, "p N N"]]
 
 
 @runtime_checkable
@@ -37,6 +37,10 @@ class Term(Protocol):
             matrices: M, D, K.
             slopes: (p, N, N) their changes.
         """
+        ...
+
+    def sums(self, matrices: Triple, slopes: Slopes) -> Sums:
+        """What a step of a fit needs of both."""
         ...
 
 
@@ -61,6 +65,9 @@ class LineTerm(eqx.Module):
         r, j = line_residual(self.target, matrices, self.sensed)
         return r, j @ onto.T
 
+    def sums(self, matrices: Triple, slopes: Slopes) -> Sums:
+        return sums_of(*self.evaluate(matrices, slopes))
+
 
 class ResponseTerm(eqx.Module):
     """An impulse response: the Markov parameters of the sampled system.
@@ -68,6 +75,7 @@ class ResponseTerm(eqx.Module):
     Attributes:
         h: (samples, outputs, inputs) measured.
         weight: (samples, outputs, inputs) one over the noise, 0 where a sample is not to count.
+        laid: both but for the first sample, in the order in which products of blocks make a response.
         whitener: (outputs, samples, samples) makes the weighted noise of each output independent in time; None where
             it is.
         dt: sampling interval, s.
@@ -77,6 +85,7 @@ class ResponseTerm(eqx.Module):
 
     h: Float[Array, "samples outputs inputs"]
     weight: Float[Array, "samples outputs inputs"]
+    laid: tuple[Float[Array, "_ _ _ _"], Float[Array, "_ _ _ _"]]
     whitener: Float[Array, "outputs samples samples"] | None
     dt: Float[Array, ""]
     sensed: SecondOrderModel
@@ -91,12 +100,24 @@ class ResponseTerm(eqx.Module):
             left = self.left(matrices, slopes)
             rows = jnp.einsum("oab,pboi->paoi", self.whitener, left).reshape(len(left), -1)
             return rows[0], rows[1:].T
-        # the data in the order of the blocks, rather than all slopes in that of time
-        first, later = self._blocks(matrices, slopes)
-        h, weight = (_in_blocks(x[1:], later.shape) for x in (self.h, self.weight))
-        parts = (first.at[0].add(-self.h[0]) * self.weight[0], later.at[0].add(-h) * weight)
-        rows = jnp.concatenate([x.reshape(len(x), -1) for x in parts], axis=1)
+        rows = jnp.concatenate(self._parts(matrices, slopes), axis=1)
         return rows[0], rows[1:].T
+
+    def sums(self, matrices: Triple, slopes: Slopes) -> Sums:
+        if self.whitener is not None:
+            return sums_of(*self.evaluate(matrices, slopes))
+        # one product of all rows with themselves, which are never put side by side
+        first, later = self._parts(matrices, slopes)
+        both = first @ first.T + later @ later.T
+        return 0.5 * both[0, 0], both[1:, 1:], both[1:, 0]
+
+    def _parts(self, matrices: Triple, slopes: Slopes) -> tuple[Array, Array]:
+        """Weighted rows of the first sample and of the others, the data in the order of the blocks."""
+        first, later = self._blocks(matrices, slopes)
+        h, weight = self.laid
+        parts = (first.at[0].add(-self.h[0]) * self.weight[0], later.at[0].add(-h) * weight)
+        a, b = (x.reshape(len(x), -1) for x in parts)
+        return a, b
 
     def left(self, matrices: Triple, slopes: Slopes) -> Float[Array, "_ samples outputs inputs"]:
         """Weighted model less measured, then its changes, in the order of time.
@@ -152,6 +173,9 @@ class FrequencyTerm(eqx.Module):
         rows = both.reshape(len(both), -1)
         rows = jnp.concatenate([rows.real, rows.imag], axis=1)
         return rows[0], rows[1:].T
+
+    def sums(self, matrices: Triple, slopes: Slopes) -> Sums:
+        return sums_of(*self.evaluate(matrices, slopes))
 
 
 def product(x: Stack, y: Stack) -> Stack:
@@ -218,8 +242,7 @@ def _markov_blocks(
 ) -> tuple[Stack, Float[Array, "_ _ _ _ _"]]:
     """D, and C A^(j q) A^k B as (1 + p, j, outputs, k, inputs): sample 1 + j q + k, products of about sqrt(samples)
     rows with as many columns, and their changes."""
-    doublings = max(0, round(math.log2(max(samples - 1, 1)) / 2))
-    outer = max(1, -(-(samples - 1) // 2**doublings))
+    outer, doublings = _blocks_of(samples)
     columns, stride = B, A
     for _ in range(doublings):
         columns, stride = _doubled(stride, columns), product(stride, stride)
@@ -231,17 +254,24 @@ def _markov_blocks(
     return D, both.reshape(len(A), outer, C.shape[1], 2**doublings, B.shape[2])
 
 
+def _blocks_of(samples: int) -> tuple[int, int]:
+    """How many blocks the samples after the first are in, and the logarithm to base 2 of their length."""
+    doublings = max(0, round(math.log2(max(samples - 1, 1)) / 2))
+    return max(1, -(-(samples - 1) // 2**doublings)), doublings
+
+
 def _in_time(blocks: Float[Array, "_ _ _ _ _"]) -> Float[Array, "_ _ _ _"]:
     """(1 + p, samples, outputs, inputs) from blocks."""
     stacked, outer, outputs, inner, inputs = blocks.shape
     return jnp.swapaxes(blocks, 2, 3).reshape(stacked, outer * inner, outputs, inputs)
 
 
-def _in_blocks(x: Float[Array, "samples outputs inputs"], shape: tuple[int, ...]) -> Float[Array, "_ _ _ _"]:
-    """Samples as (j, outputs, k, inputs), zeros after the last."""
-    _, outer, outputs, inner, inputs = shape
-    padded = jnp.zeros((outer * inner, outputs, inputs), x.dtype).at[: len(x)].set(x)
-    return jnp.swapaxes(padded.reshape(outer, inner, outputs, inputs), 1, 2)
+def in_blocks(x: Float[Array, "samples outputs inputs"]) -> Float[Array, "_ _ _ _"]:
+    """All samples but the first as (j, outputs, k, inputs), zeros after the last."""
+    outer, doublings = _blocks_of(len(x))
+    _, outputs, inputs = x.shape
+    padded = jnp.zeros((outer * 2**doublings, outputs, inputs), x.dtype).at[: len(x) - 1].set(x[1:])
+    return jnp.swapaxes(padded.reshape(outer, 2**doublings, outputs, inputs), 1, 2)
 
 
 def _transposed(x: Stack) -> Stack:

@@ -128,9 +128,7 @@ def refine_response(
 def _spread(term: ResponseTerm, fit: BoundedFit, noise: CorrelatedNoise) -> np.ndarray:
     """Covariance of J'r of a fit whose weights are not those of its noise."""
     unknowns = fit.unknowns
-    mix = np.asarray(unknowns.mix) * np.asarray(unknowns.scale)
-    mass, damping, stiffness = (jnp.asarray(np.einsum("ep,eij->pij", mix, x)) for x in unknowns.directions)
-    left = term.left(unknowns.matrices(fit.posterior.theta), (mass, damping, stiffness))
+    left = term.left(unknowns.matrices(fit.posterior.theta), unknowns.slopes)
     return np.asarray(noise.covariance(left[1:] * term.weight))
 
 
