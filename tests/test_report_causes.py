@@ -1,5 +1,7 @@
 """The second half of the report of a diagnosis: effects, fitted law, before and after, closure."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from gap_helpers import DT, JOINT, SAMPLES, chain, drive, noisy, record, with_ef
 
 from jaxsid import Effect, diagnose
 from jaxsid.gap.force_map import ForceMap
+from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
 from jaxsid.gap.verdict import LAPSE
 from jaxsid.report.causes_page import closure_cards, closure_section, numbers_section, which_section
@@ -61,6 +64,16 @@ def test_the_cards_hold_the_gap_before_and_after(cubic):
     assert before.value.startswith(f"{100 * cubic.closure.before:.1f}")
     assert float(after.value.split()[0]) < 1.3 * float(noise.value.split()[0])
     assert probability.value == share_of(1 - LAPSE)
+
+
+def test_where_the_noise_is_a_bound_the_cards_say_so(cubic):
+    _, plain, _, _ = closure_cards(cubic)
+    guess = tuple(Noise(n.level, n.taps, 0.0, "residual") for n in cubic.causes.noises)
+    bounded = cubic._replace(causes=cubic.causes._replace(noises=guess, places=SimpleNamespace()))
+    _, after, noise, _ = closure_cards(bounded)
+    assert noise.value.startswith("at most ")
+    assert "of it explained, if noise is as large as it may be" in after.remark
+    assert "as it may be" not in plain.remark
 
 
 def test_the_ranking_names_kind_place_and_parameters(cubic):

@@ -50,12 +50,14 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
     if found.causes is not None and found.causes.selected and name == "effect":
         chance_of *= float(np.prod([x.probability for x in found.causes.selected]))
         remark = "of this explanation, of all that were tried"
+    # with less noise than its bound less would be explained
+    supposed = ", if noise is as large as it may be" if _most(found) else ""
     return (
         Card("Gap before", misfit(closure.before), "nominal model, held-out samples (NRMSE)"),
         Card(
             "Gap after",
             misfit(closure.after),
-            f"{chosen_name(found)}: {percent(closure.fraction)} of it explained",
+            f"{chosen_name(found)}: {percent(closure.fraction)} of it explained{supposed}",
         ),
         Card("Noise alone", f"{_most(found)}{percent(closure.noise_floor)}", "as small as a gap can be"),
         Card("Probability", share_of(chance_of), remark),
