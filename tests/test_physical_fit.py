@@ -8,7 +8,7 @@ from band_limited import DT, band_noise, chain, error, respond, state_space
 from scipy import linalg, signal
 
 from jaxsid.impulse.lines import record_lines
-from jaxsid.physical.inband_fit import _lines_and_slopes, _motion, _symmetric, fit_matrices, fit_target
+from jaxsid.physical.inband_fit import _motion, _symmetric, fit_matrices, fit_target, line_model
 from jaxsid.physical.parameterization import PositiveMatrices, SymmetricMatrices, entry_sizes
 from jaxsid.records import ContinuousModel, Realization, Record, SecondOrderModel
 
@@ -95,7 +95,7 @@ def test_positive_matrices_are_positive_whatever_the_unknowns():
 def test_slopes_are_those_of_automatic_differentiation():
     goal = target(0.01)
     upper = jnp.concatenate([x[np.triu_indices(2)] for x in TRUTH])
-    model = lambda x: _lines_and_slopes(goal, _symmetric(x, 2), SENSED)  # noqa: E731
+    model = lambda x: line_model(goal, _symmetric(x, 2), SENSED)  # noqa: E731
     slopes = jax.jit(model)(upper)[1]
     other = jax.jit(jax.jacfwd(lambda x: model(x)[0]))(upper)
     np.testing.assert_allclose(

@@ -23,7 +23,7 @@ from jaxsid.impulse.lines import Lines
 from jaxsid.least_squares import levenberg_marquardt
 from jaxsid.mechanics.functions_of_matrices import exponential_with_slopes
 from jaxsid.mechanics.inverses import inverse_each
-from jaxsid.physical.parameterization import BLIND, Parameterization, Triple
+from jaxsid.physical.parameterization import BLIND, Parameterization, Slopes, Triple
 from jaxsid.records import ContinuousModel, Realization, SecondOrderModel
 
 STEPS = 200
@@ -42,6 +42,7 @@ class Target(NamedTuple):
         drive: (lines, inputs) spectrum of the held inputs.
         y: (lines, outputs) measured, less what sampling adds.
         weight: (lines, outputs) one over the noise, 0 where nothing was measured.
+        sampling: how what sampling adds changes with M, D, K; None where it is taken for given.
     """
 
     s: Complex[Array, " lines"]
@@ -51,6 +52,19 @@ class Target(NamedTuple):
     drive: Complex[Array, "lines inputs"]
     y: Complex[Array, "lines outputs"]
     weight: Float[Array, "lines outputs"]
+    sampling: "Sampling | None" = None
+
+
+class Sampling(NamedTuple):
+    """What sampling adds to lines, to first order.
+
+    Attributes:
+        about: (entries,) upper triangles of the M, D, K that it is zero at: there `Target.y` has it subtracted.
+        slopes: (lines, entries, outputs) by these.
+    """
+
+    about: Float[Array, " entries"]
+    slopes: Complex[Array, "lines entries outputs"]
 
 
 class MatrixFit(NamedTuple):
@@ -132,7 +146,7 @@ def fit_matrices(
     size = len(sensed.mass)
 
     def entries(theta: Array) -> Array:
-        return jnp.concatenate([x[np.triu_indices(size)] for x in parameterization.matrices(theta)])
+        return upper_triangles(parameterization.matrices(theta))
 
     def evaluate(upper: Array) -> tuple[Array, Array]:
         return line_residual(target, _symmetric(upper, size), sensed)
@@ -170,7 +184,11 @@ def line_residual(target: Target, matrices: Triple, sensed: SecondOrderModel) ->
         matrices: M, D, K.
         sensed: gives the input matrix and the sensors.
     """
-    model, slopes = _lines_and_slopes(target, matrices, sensed)
+    model, slopes = line_model(target, matrices, sensed)
+    if target.sampling is not None:
+        moved = upper_triangles(matrices) - target.sampling.about
+        model = model + jnp.einsum("keo,e->ko", target.sampling.slopes, moved)
+        slopes = slopes + target.sampling.slopes
     return _without_transients(target, target.y - model, -slopes, *_motion(target, matrices), sensed)
 
 
@@ -208,6 +226,16 @@ def _covariance(product: Array, before: tuple[Array, ...], slopes: tuple[Array, 
     return directions @ jnp.linalg.solve(within, directions.T)
 
 
+def upper_triangles(matrices: Triple) -> Float[Array, " entries"]:
+    """Of M, D, K, row by row."""
+    return jnp.concatenate([x[np.triu_indices(len(x))] for x in matrices])
+
+
+def entry_slopes(size: int) -> Slopes:
+    """(entries, N, N) changes of M, D, K with each entry of their upper triangles."""
+    return _symmetric(jnp.eye(3 * size * (size + 1) // 2), size)
+
+
 def _symmetric(upper: Float[Array, "*shape entries"], size: int) -> tuple[Array, Array, Array]:
     """M, D, K from their upper triangles, row by row, (..., entries)."""
     at = np.zeros((size, size), int)
@@ -224,8 +252,14 @@ def _state_matrix(matrices: Triple) -> Array:
     return jnp.concatenate([jnp.eye(len(M), 2 * len(M), len(M)), per_mass])
 
 
-def _lines_and_slopes(target: Target, matrices: Triple, sensed: SecondOrderModel) -> tuple[Array, Array]:
-    """Modelled lines (lines, outputs) and their derivatives (lines, entries, outputs) to the upper triangles."""
+def line_model(target: Target, matrices: Triple, sensed: SecondOrderModel) -> tuple[Array, Array]:
+    """Lines in continuous time (lines, outputs), and derivatives (lines, entries, outputs) to the upper triangles.
+
+    Args:
+        target: frequencies and inputs.
+        matrices: M, D, K.
+        sensed: gives the input matrix and the sensors.
+    """
     s = target.s[:, None, None]
     M, D, K = matrices
     inverse = inverse_each(M * s**2 + D * s + K)
@@ -244,7 +278,7 @@ def _motion(target: Target, matrices: Triple) -> tuple[Array, Array]:
     M, _, K = matrices
     size = len(M)
     A = _state_matrix(matrices)
-    one = _symmetric(jnp.eye(3 * size * (size + 1) // 2), size)  # dM, dD, dK of each entry
+    one = entry_slopes(size)
     pushed = -jnp.linalg.solve(M, jnp.concatenate([one[2], one[1]], axis=2) + one[0] @ A[size:])
     stack = jnp.concatenate([A[None], jnp.concatenate([jnp.zeros_like(pushed), pushed], axis=1)])
     # displacements in units in which they are about as large as velocities

@@ -3,14 +3,18 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.checks import InsufficientDataError
-from jaxsid.impulse.lines import Lines, record_lines
+from jaxsid.impulse.lines import NOISE_LOSS, Lines, record_lines
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.simulate import ordered_inputs, simulate
-from jaxsid.physical.inband_fit import Target, fit_target
+from jaxsid.physical.bounded import within_bounds
+from jaxsid.physical.inband_fit import fit_target
+from jaxsid.physical.parameterization import Triple
 from jaxsid.physical.restrictions import Restricted
+from jaxsid.physical.sampled_lines import with_sampling
 from jaxsid.physical.terms import LineTerm
 from jaxsid.physical.widened import widened_start
 from jaxsid.pipeline.correlations import correlations
@@ -26,7 +30,7 @@ from jaxsid.pipeline.refining import (
 )
 from jaxsid.pipeline.setting import setting
 from jaxsid.pipeline.state_space import StateSpace, state_space
-from jaxsid.records import Record, Residuals, as_array
+from jaxsid.records import Record, Residuals, SecondOrderModel, as_array
 from jaxsid.refinement import Refinement, Validation
 
 HELD_OUT = 0.25  # part of the end of every record that is kept for validation
@@ -52,13 +56,14 @@ def refine_records(
     say("a start from the poles")
     highest = 2 * np.pi * float(np.asarray(space.lines.band)[1])
     near = known.unknowns.unknowns(widened_start(known.unknowns, space.model, sensed, highest))
-    every = LineTerm(_target(space, space.lines, np.asarray(space.polished.noise)), sensed)
+    begun = known.unknowns.matrices(nominal_unknowns(known))
+    every = _term(space, space.lines, np.asarray(space.polished.noise), sensed, begun, False)
     early, late = zip(*(_split(r) for r in records), strict=True)
     train = None
     if how.validate:
         low, high = np.asarray(space.lines.band).tolist()
         first = _padded(record_lines(early, outputs=system.outputs, band=(low, high)), len(space.lines.z))
-        train = (LineTerm(_target(space, first, _noise_on(first, space)), sensed),)
+        train = (_term(space, first, _noise_on(first, space), sensed, begun, False),)
     say("mass, damping and stiffness")
     nuisances = len(records) * (2 * len(model.bodies) + 1) * len(system.outputs)
     problem = Problem(
@@ -70,8 +75,14 @@ def refine_records(
         solver=how.solver,
         profiled=how.profiled,
         scattered=how.scattered,
+        loss=NOISE_LOSS,
     )
     fit, before = solved(problem)
+    if "band" not in lines.hold:
+        matrices = known.unknowns.matrices(fit.posterior.theta)
+        own = _term(space, space.lines, np.asarray(space.polished.noise), sensed, matrices, True)
+        problem = problem._replace(every=(own,))
+        fit = within_bounds(problem.every, known, fit.posterior.theta, how.solver)
     say("validation")
 
     def errors(m: LumpedModel, given: Sequence[Record] = records) -> np.ndarray:
@@ -88,8 +99,19 @@ def refine_records(
     return with_input_warning(found)
 
 
-def _target(space: StateSpace, lines: Lines, noise: np.ndarray) -> Target:
-    return fit_target(lines, as_array(noise), space.polished.realization, space.model)
+def _term(
+    space: StateSpace,
+    lines: Lines,
+    noise: np.ndarray,
+    sensed: SecondOrderModel,
+    matrices: Triple,
+    fitted: bool,
+) -> LineTerm:
+    """Lines to fit to, with what sampling adds as the state-space model has it, or matrices that were fitted to it."""
+    target = fit_target(lines, as_array(noise), space.polished.realization, space.model)
+    if "band" not in lines.hold:
+        target = with_sampling(target, lines, matrices, sensed, jnp.asarray(fitted))
+    return LineTerm(target, sensed)
 
 
 def _split(record: Record) -> tuple[Record, Record]:

@@ -68,6 +68,7 @@ class Problem(NamedTuple):
         nuisances: number of unknowns, such as those of transients, that the terms project out.
         weighed: whether the level of the noise is known, so that a fit can be told to be good.
         solver, profiled, scattered: as in `Manner`.
+        loss: by how much variances exceed those of weights that are known.
     """
 
     known: Restricted
@@ -79,6 +80,7 @@ class Problem(NamedTuple):
     solver: Solver | None = None
     profiled: tuple[int, ...] = ()
     scattered: Array | None = None
+    loss: float = 1.0
 
 
 def solved(problem: Problem) -> tuple[BoundedFit, BoundedFit | None]:
@@ -153,7 +155,7 @@ def _uncertainty(problem: Problem, fit: BoundedFit, spread: Spread | None) -> _U
     p = fit.posterior
     free = problem.nuisances + int((np.diag(np.asarray(p.information)) > 0).sum())
     misfit = float(p.squares) / max(int(p.equations) - free, 1)
-    told = np.asarray(p.information) / max(misfit, 1.0)
+    told = np.asarray(p.information) / max(misfit, 1.0) / problem.loss
     precision = np.diag(np.where(fit.at_bound, 0.0, np.asarray(problem.known.prior.weight)) ** 2)
     both = told + precision
     inverse = _inverse(both)
