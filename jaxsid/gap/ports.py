@@ -13,7 +13,7 @@ from jaxsid.compilation import compiled
 from jaxsid.gap.evidence import Force, Table, density, factor_of, split, table
 from jaxsid.gap.places import Place, joint_of
 from jaxsid.gap.setting import Setting
-from jaxsid.gap.signals import Extent, extent, shapes, signals
+from jaxsid.gap.signals import UNUSED, Extent, extent, shapes, signals
 from jaxsid.gap.spectra import (
     Motion,
     Spectra,
@@ -120,7 +120,20 @@ def columns_of(given: Setting, port: Ports, motion: Motion, size: Extent | None)
     pair = signals(port.kind, spectra, motion, port.joint, port.sensor, port.drive)
     held = transfers_of(spectra, port)[1]
     shaped = held[:, :, None] * shapes(port.kind, spectra, pair, size, given.rate)[:, None, :]
+    shaped = shaped.at[:, :, UNUSED].add(_read_before(spectra, port, size))
     return jnp.concatenate([elements, shaped], axis=2)
+
+
+def _read_before(spectra: Spectra, port: Ports, size: Extent) -> Complex[Array, "lines outputs"]:
+    """An accelerometer sees a held input at once, but the step before where the input comes late, however little.
+
+    So what a small delay or lag does to readings is far more than what it does to the motion. Zeros unless the place
+    is an input.
+    """
+    linear = spectra.linear
+    seen = linear.acceleration_sensors @ spectra.inverse_mass @ linear.input_matrix @ port.drive
+    step = (jnp.exp(-1j * spectra.omega * spectra.dt) - 1) * (spectra.u @ port.drive)
+    return step[:, None] * seen / jnp.maximum(size.rms[0], jnp.finfo(seen.dtype).tiny)
 
 
 @compiled

@@ -22,6 +22,7 @@ LAGS = (0.02, 0.05, 0.15, 0.3, 0.6)  # time constants, times the rate of the mod
 LATE = (0.02, 0.05, 0.1, 0.2, 0.4)  # delays, likewise
 MOST = 2 * HATS + len(STEPS) + 9 + len(PLAYS)
 LINEAR = slice(2 * HATS, 2 * HATS + len(LAGS) + len(LATE) + 1)  # what delays and lags a signal
+UNUSED = MOST - 1  # no shape of a signal
 
 
 class Extent(NamedTuple):
