@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from jaxsid.compilation import default_folder, keep_programs
+from jaxsid.compilation import default_folder, keep_programs, release_programs
 from jaxsid.gap.examine import examine
 from jaxsid.mechanics.lumped import Connection, Input, LumpedModel, Sensor, lumped_model, second_order
 from jaxsid.records import Record
@@ -232,6 +232,7 @@ def main() -> None:
     # one shape after another, so that its programs serve all of its cases
     for number in sorted(set(range(cases)) - done, key=lambda i: (i // 45, i % len(SHAPES), i)):
         lines.append(examined(number))
+        release_programs()
         with path.open("a") as file:
             file.write(json.dumps(lines[-1]) + "\n")
     print(Counter(x["finding"] for x in lines), f"of {len(lines)}")

@@ -19,7 +19,7 @@ import scipy.linalg
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from effects_truth import GROUND, Chain, Truth  # pyright: ignore[reportMissingImports]
 
-from jaxsid.compilation import default_folder, keep_programs
+from jaxsid.compilation import default_folder, keep_programs, release_programs
 from jaxsid.gap.locate import Locations, locate
 from jaxsid.gap.places import Place
 from jaxsid.mechanics.lumped import Connection, Input, LumpedModel, Sensor, lumped_model
@@ -262,6 +262,7 @@ def main() -> None:
     done = {x["case"] for x in lines}
     for number in sorted(set(range(cases)) - done):
         lines.append(examined(number, seeds))
+        release_programs()
         with path.open("a") as file:
             file.write(json.dumps(lines[-1]) + "\n")
     summary(lines)

@@ -21,7 +21,7 @@ from jaxsid.records import Record
 
 # Raw evidence is overconfident, for what no basis of shapes holds decides, not noise: it is divided by this.
 TEMPERATURE = 100.0
-SAME = 3.0  # tempered difference of logarithms of evidence, found or expected, below which places are not told apart
+SAME = 2.0  # tempered difference of logarithms of evidence, found or expected, below which places are not told apart
 MOST_MAPS = 3  # places of which the force is reported
 UNEXPLAINED = (
     2.0  # mean square, in noise, across a place's transfer, from which on no force there explains the records
