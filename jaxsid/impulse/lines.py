@@ -31,11 +31,11 @@ from jaxsid.records import Record
 # Excited means: smoothed input power within this ratio of its largest value.
 EXCITED = 1 / 400
 FEWEST_LINES = 12  # with power; a tone has up to six
-# The band is spread over this part of the circle of the Laguerre shift, so that regressions in it are well posed.
 NEIGHBOURS = 24  # lines on either side over which a level is averaged
 # By how much variances grow as weights are such levels and not the truth: J. Schoukens, R. Pintelon, G. Vandersteen and
 # P. Guillaume, Automatica 33 (1997), for as many averages.
 NOISE_LOSS = ((2 * NEIGHBOURS) / (2 * NEIGHBOURS - 1)) ** 2
+# The band is spread over this part of the circle of the Laguerre shift, so that regressions in it are well posed.
 BAND_ANGLE = 0.8 * np.pi
 Points = TypeVar("Points", Array, np.ndarray)
 
