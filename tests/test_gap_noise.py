@@ -6,6 +6,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, record
 from scipy.signal import lfilter
 
 from jaxsid.checks import InputError
+from jaxsid.gap.decay import without_decays
 from jaxsid.gap.noise import Noise, no_louder, noise_of, period_of, quiet_part, quieter, residual_noise
 
 LEVEL = 0.05
@@ -131,3 +132,35 @@ def test_bad_input():
         noise_of(chain(), [record(u, y)])
     with pytest.raises(InputError, match="too little"):
         noise_of(chain(), [record(u[:20], y[20:40])])
+
+
+@pytest.mark.parametrize("periods", [2, 3])
+@pytest.mark.parametrize("level", [0.0, LEVEL, 20 * LEVEL])
+def test_noise_from_periods_does_not_hang_on_the_model(periods, level):
+    """From rest the first period differs from the next by a free decay, whose frequencies the model need not know."""
+    u = drive(periods * 512, periods=periods)
+    white = level * np.random.default_rng(0).standard_normal((len(u), 3))
+    y = exact(u) + white
+    (noise,) = noise_of(chain(factor=1.03), [record(u, y)])
+    assert noise.source == "periods"
+    np.testing.assert_allclose(noise.rms(), level, rtol=0.1, atol=1e-6 * y.std())
+
+
+def test_exponentials_are_taken_out_exactly_and_noise_is_not():
+    t = np.arange(900)
+    modes = np.stack([np.exp(-0.002 * t) * np.cos(0.03 * t), 0.999**t, np.sin(0.4 * t + 1)], axis=1)
+    signal = modes @ np.random.default_rng(0).standard_normal((3, 4))
+    assert np.abs(without_decays(signal, 5, 0.5)).max() < 1e-9 * np.abs(signal).max()
+    white = np.random.default_rng(1).standard_normal((900, 4))
+    both = without_decays(signal + 0.01 * white, 5, 0.5)
+    np.testing.assert_allclose(both.std(axis=0), 0.01, rtol=0.05)
+    alone = without_decays(white, 5, 0.5)
+    np.testing.assert_allclose(alone.std(axis=0), 1.0, rtol=0.05)
+
+
+@pytest.mark.parametrize("samples", [6, 40])
+def test_too_few_samples_are_left_as_they_are(samples):
+    signal = np.random.default_rng(0).standard_normal((samples, 1))
+    left = without_decays(signal, 6, 1.0)
+    assert left.shape == signal.shape
+    assert np.isfinite(left).all()

@@ -17,7 +17,7 @@ from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
-from jaxsid.gap.words import next_experiment, remaining, summary
+from jaxsid.gap.words import about_numbers, next_experiment, remaining, summary
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
@@ -264,7 +264,7 @@ def diagnose(
         causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
     )
     causes, verdict = concluded(found, causes)
-    said = _warnings(model, seen, found, verdict, initial == "rest")
+    said = _warnings(model, seen, found, causes, verdict, initial == "rest")
     return Diagnosis(
         model, records, found, causes, verdict, _experiment(model, seen, causes, verdict, progress), said
     )
@@ -288,7 +288,12 @@ def _experiment(
 
 
 def _warnings(
-    model: LumpedModel, records: tuple[Record, ...], found: Examination, verdict: Verdict, rest: bool
+    model: LumpedModel,
+    records: tuple[Record, ...],
+    found: Examination,
+    causes: Causes | None,
+    verdict: Verdict,
+    rest: bool,
 ) -> tuple[str, ...]:
     said = []
     if model.effects:
@@ -315,6 +320,8 @@ def _warnings(
     # what a law explains has its place by the law, not by the force alone
     if found.locations is not None and verdict.name in ("unknown", "ambiguous"):
         said += found.locations.remarks
+    if verdict.name != "none" and (causes is None or not causes.selected):
+        said += about_numbers(found)
     return tuple(said)
 
 

@@ -20,6 +20,7 @@ from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.records import Record, as_array
 
 FAR = 10.0  # times less that a refit leaves, from which on the tolerance may be wrong
+NEARER = 2.0  # likewise, where the nominal model leaves more than there was
 NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
 
 
@@ -73,6 +74,12 @@ class Examination(NamedTuple):
     def guessed(self) -> bool:
         """Whether noise is a guess from the quietest band: too high if the gap is there too, too low if coloured."""
         return self.finding == "structure" and any(n.degrees <= 0 for n in self.noises)
+
+    @property
+    def far_off(self) -> bool:
+        """Whether the model's numbers lie so far from the truth that nothing told beside them is to be trusted."""
+        useless = any(x > 1 for x in self.before.nrmse.values())
+        return self.before.total > (NEARER if useless else FAR) * self.recalibrated.total
 
     def as_dict(self) -> dict[str, Any]:
         """The parts `gap` and `locations` of diagnosis.json."""
@@ -157,7 +164,7 @@ def examine(
         before=gaps[0],
         recalibrated=gaps[1],
         refit=freely.model,
-        locations=_located(of, nothing, after) if structural and of is not None else None,
+        locations=located(of) if structural and of is not None else None,
         noises=noises,
         elements=_values(model, freely),
         beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
@@ -186,16 +193,3 @@ def _beside(nominal: Recalibrated, refit: Recalibrated, number: int) -> Beside:
     left = (np.asarray(in_time(x.settings[number].spectra, x.linear[number].left)) for x in (nominal, refit))
     y = np.where(np.asarray(spectra.present) > 0, y, np.nan)
     return Beside(y, *(y - x for x in left))
-
-
-def _located(of: Scored, nothing: Recalibrated, after: Recalibrated) -> Locations:
-    found = located(of)
-    ratio = math.sqrt(nothing.squares / max(after.squares, 1e-300))
-    if ratio < FAR:
-        return found
-    remark = (
-        f"A refitted linear model leaves {ratio:.2g} times less than the nominal one. Unless the effect does that, "
-        "its parameters lie beyond their tolerance and the places are not to be trusted: "
-        "run identify first, and diagnose with the model that it writes."
-    )
-    return found._replace(remarks=(*found.remarks, remark))

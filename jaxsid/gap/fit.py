@@ -169,7 +169,11 @@ class _Normal(NamedTuple):
         p + 1); the logarithm of the states' determinant."""
         back, determinant = self.chain.solved(np.concatenate([self.mixed, self.slopes[:, :, None]], axis=2))
         whole = np.concatenate([self.own, self.slope[:, None]], axis=1)
-        return whole - np.einsum("wnp,wnq->pq", self.mixed, back), back, determinant
+        reduced = whole - np.einsum("wnp,wnq->pq", self.mixed, back)
+        # of what the states can do in a parameter's place rounding may leave less than nothing
+        rows = np.arange(len(self.own))
+        reduced[rows, rows] = np.maximum(reduced[rows, rows], np.finfo(float).eps * self.own[rows, rows])
+        return reduced, back, determinant
 
 
 def links_of(blocks: Sequence[Block]) -> Links:

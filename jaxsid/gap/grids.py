@@ -148,7 +148,8 @@ def quantiles(prior: Prior, count: int) -> np.ndarray:
         return prior.lowest + at * (prior.highest - prior.lowest)
     if prior.shape == "log-normal":
         # even steps: what lies between two points is as far from either
-        return prior.centre * prior.spread ** (np.linspace(-2, 2, count) if count > 1 else np.zeros(1))
+        ratios = prior.centre * prior.spread ** (np.linspace(-2, 2, count) if count > 1 else np.zeros(1))
+        return np.maximum(ratios, prior.lowest)
     normal = NormalDist(prior.centre, prior.spread)
     low, high = normal.cdf(prior.lowest), normal.cdf(prior.highest)
     if prior.lowest == prior.centre and count > 4:

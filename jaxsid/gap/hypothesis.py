@@ -76,17 +76,20 @@ class Coordinates(eqx.Module):
         ratio = np.where(
             raised >= 0, given / np.asarray(self.scale) ** np.where(raised >= 0, power, 1.0), plain
         )
-        centre, spread, size = (np.asarray(x) for x in (self.centre, self.spread, self.logarithmic))
-        positive = np.where(size & (ratio > 0), ratio, centre)
-        log = np.log(np.where(size, positive / np.where(size, centre, 1.0), 1.0)) / np.where(
-            size, np.log(spread), 1.0
-        )
-        return np.where(size, log, (np.maximum(ratio, np.asarray(self.lowest)) - centre) / spread)
+        sensible = np.where(np.asarray(self.logarithmic) & (ratio <= 0), np.asarray(self.centre), ratio)
+        return self._standard(np.maximum(sensible, np.asarray(self.lowest)))
 
     def least(self) -> Float[np.ndarray, "slots most"]:
         """Smallest unknowns that make sense."""
-        lowest = (np.asarray(self.lowest) - np.asarray(self.centre)) / np.asarray(self.spread)
-        return np.where(np.asarray(self.logarithmic), -np.inf, lowest)
+        return self._standard(np.asarray(self.lowest))
+
+    def _standard(self, ratio: Float[np.ndarray, "slots most"]) -> Float[np.ndarray, "slots most"]:
+        """Unknowns of ratios."""
+        centre, spread, size = (np.asarray(x) for x in (self.centre, self.spread, self.logarithmic))
+        positive = np.where(size & (ratio > 0), ratio, 1.0)
+        log = np.log(positive / np.where(size, centre, 1.0)) / np.where(size, np.log(spread), 1.0)
+        log = np.where(ratio > 0, log, -np.inf)
+        return np.where(size, log, (ratio - centre) / spread)
 
 
 class Moved(NamedTuple):
@@ -179,7 +182,7 @@ def _coordinate(prior: Prior) -> dict[str, float]:
         "centre": prior.centre,
         "spread": prior.spread,
         "deviation": 1.0,
-        "lowest": prior.lowest if prior.lowest > prior.centre - 3.99 * prior.spread else -np.inf,
+        "lowest": prior.lowest if prior.bounded else -np.inf,
         "logarithmic": prior.shape == "log-normal",
     }
 

@@ -1,7 +1,7 @@
 """Level and colour of each sensor's noise, from the best part of the records that tells of it.
 
 In this order: periods of a periodic record, records of equal inputs, a part without input, and else the quietest band
-of what a model leaves. Free responses of the model are taken out of all of them.
+of what a model leaves. Free decays are taken out of all of them.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsid.checks import require
+from jaxsid.gap.decay import without_decays
 from jaxsid.gap.spectra import Spectra, spectra_of
 from jaxsid.impulse.whitening import MOST, whitening_filter
-from jaxsid.mechanics.lumped import LumpedModel
+from jaxsid.mechanics.first_order import physical_displacement_velocity
+from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.simulate import measured_sensors
 from jaxsid.records import Record
 
@@ -90,10 +92,11 @@ def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Nois
     if again:
         pair = (record, again[0])
         apart = (np.asarray(pair[0].y) - np.asarray(pair[1].y)) / np.sqrt(2)
-        return _of_signals(model, _without_input(record, apart), SOURCES[1])
+        return _of_signals(model, _without_input(record, _still(model, record, apart)), SOURCES[1])
     quiet = quiet_part(np.asarray(record.u))
     if quiet is not None:
-        return _of_signals(model, _without_input(record, np.asarray(record.y)[quiet]), SOURCES[2])
+        y = _still(model, record, np.asarray(record.y)[quiet])
+        return _of_signals(model, _without_input(record, y), SOURCES[2])
     return floor(spectra_of(model, record))
 
 
@@ -151,13 +154,19 @@ def _without_input(record: Record, y: np.ndarray) -> Record:
 
 def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
     count = len(record.u) // period
-    y = np.asarray(record.y)[-count * period :].reshape(count, period, -1)
-    apart = np.diff(y, axis=0) / np.sqrt(2)
+    y = np.asarray(record.y)[-count * period :]
+    apart = _still(model, record, (y[period:] - y[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
     signals = np.stack([_cleared(spectra_of(model, _without_input(record, x))) for x in apart])
-    # free responses that the model's do not match die out from period to period
+    # what a law beside the model does to free responses dies out from period to period
     level = np.sqrt(np.nanmean(signals**2, axis=1))
     used = (level <= SAME_PERIOD * np.nanmin(level, axis=0)) | np.isnan(level)
     return _fitted(signals[used.all(axis=1)] if used.all(axis=1).any() else signals[-1:], SOURCES[0])
+
+
+def _still(model: LumpedModel, record: Record, y: np.ndarray) -> np.ndarray:
+    """Samples without input, and without the free decays of what was measured."""
+    poles = np.linalg.eigvals(np.asarray(physical_displacement_velocity(second_order(model)).A))
+    return without_decays(y, len(poles), float(np.abs(poles).max() * float(record.dt)))
 
 
 def _of_signals(model: LumpedModel, record: Record, source: str) -> Noise:

@@ -74,7 +74,7 @@ def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
         x, y: explanations.
         of: the ranking that they are in.
     """
-    return abs(x.evidence - y.evidence) / of.scale / of.temperature < SAME
+    return bool(abs(x.evidence - y.evidence) / of.scale / of.temperature < SAME)
 
 
 def key_of(kind: str, place: Mapping[str, Any]) -> Key:

@@ -6,6 +6,7 @@ from jaxsid.gap.causes import Causes
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.experiment import Experiment
 from jaxsid.gap.measure import Gap
+from jaxsid.gap.numbers import off_numbers
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import Explanation
 from jaxsid.gap.verdict import Verdict
@@ -13,6 +14,7 @@ from jaxsid.mechanics.lumped import LumpedModel
 
 TELLS = 10.0  # log evidence below which an experiment is of no use
 PARTS = 0.01  # of a body's motion that a sensor is worth asking for
+NAMED = 6  # numbers that are off
 APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 
 
@@ -91,7 +93,8 @@ def summary(found: Found) -> tuple[str, str]:
     )
     if found.verdict == "unknown":
         likely = found.examination.locations
-        place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
+        unsure = likely is None or found.examination.far_off
+        place = "" if unsure else f" Its place is most likely {_place(likely.ranked[0].place)}."
         return f"The model lacks something that no kind of effect in the catalogue explains.{place}", shrinks
     if not causes.selected:
         return "The model's structure is right, its numbers are not.", shrinks
@@ -100,6 +103,31 @@ def summary(found: Found) -> tuple[str, str]:
         others = ", ".join(named(x) for likely in found.judgement.likely for x in likely[1:])
         return f"{what[0].upper()}{what[1:]}. These records cannot tell it from {others}.", shrinks
     return f"{what[0].upper()}{what[1:]}.", shrinks
+
+
+def about_numbers(found: Examination) -> list[str]:
+    """What the best linear model says of the nominal numbers, where no effect was found that says more.
+
+    Args:
+        found: the examination.
+    """
+    off, said = off_numbers(found.elements), []
+    if off.common != 1:
+        said.append(
+            f"Refitted, masses and stiffnesses are {off.common:.3g} times the nominal ones. A gain of the inputs, or "
+            "one of all sensors, does the same: these records cannot tell them apart."
+        )
+    if found.far_off:
+        beside = " beside that" if off.common != 1 else ""
+        listed = ", ".join(f"{name} {factor:.2g}" for name, factor in off.others[:NAMED])
+        more = f", and {len(off.others) - NAMED} more" if len(off.others) > NAMED else ""
+        told = f" Times the nominal value{beside}: {listed}{more}." if listed else ""
+        said.append(
+            "The numbers of the nominal model are far from these records. Unless an effect does that, neither place "
+            f"nor kind of what else it lacks is to be trusted.{told} Run identify first, and diagnose with the model "
+            "that it writes."
+        )
+    return said
 
 
 def _place(place: Place) -> str:

@@ -6,6 +6,8 @@ from jaxtyping import Array
 from jaxsid.mechanics.effects.kind import FORCE, Kind, Motion, Parameter
 from jaxsid.mechanics.effects.prior import ANGLE, PART, Scale, size
 
+LEAST = 0.5  # of the angle's rms: what goes through less than a quarter of a turn is a load and a spring
+
 
 def _force(at: Motion, amplitude: Array, wavenumber: Array, phase: Array) -> Array:
     return amplitude * jnp.sin(wavenumber * at.displacement + phase)
@@ -16,7 +18,7 @@ EFFECT = Kind(
     where="between",
     parameters=(
         Parameter("amplitude", FORCE, Scale(force=1), PART),
-        Parameter("wavenumber", ("rad/m", "rad/rad"), Scale(displacement=-1), size(3.0, 5.0)),
+        Parameter("wavenumber", ("rad/m", "rad/rad"), Scale(displacement=-1), size(3.0, 5.0, lowest=LEAST)),
         Parameter("phase", ("rad", "rad"), Scale(), ANGLE, default=0.0),
     ),
     law="F = p sin(w d + phi)",

@@ -73,6 +73,13 @@ class Prior(NamedTuple):
         """A ratio to look at: the median of a size, an angle of zero, else one standard deviation up."""
         return self.centre + self.spread if self.shape == "normal" else self.centre
 
+    @property
+    def bounded(self) -> bool:
+        """Whether it ends below where it is still likely, because less makes no sense."""
+        if self.shape == "log-normal":
+            return self.lowest > self.centre / self.spread**REACH
+        return self.shape == "normal" and self.lowest > self.centre - REACH * self.spread
+
     def log_density(self, ratio: Array) -> Array:
         """Logarithm of the density at a ratio to the scale; -inf beyond the ends."""
         x = jnp.asarray(ratio)
@@ -98,10 +105,9 @@ class Prior(NamedTuple):
     def __str__(self) -> str:
         if self.shape == "uniform":
             return f"{self.lowest:.3g} to {self.highest:.3g}"
-        if self.shape == "log-normal":
-            return f"{self.centre:.3g}, times or over {self.spread:.3g}"
-        ends = f", at least {self.lowest:.3g}" if self.lowest > self.centre - REACH * self.spread else ""
-        return f"{self.centre:.3g} ± {self.spread:.3g}{ends}"
+        about = ", times or over " if self.shape == "log-normal" else " ± "
+        ends = f", at least {self.lowest:.3g}" if self.bounded else ""
+        return f"{self.centre:.3g}{about}{self.spread:.3g}{ends}"
 
 
 def slab(spread: float, *, centre: float = 0.0, lowest: float = -math.inf) -> Prior:
@@ -116,15 +122,16 @@ def slab(spread: float, *, centre: float = 0.0, lowest: float = -math.inf) -> Pr
     return Prior("normal", centre, spread, low, centre + REACH * spread)
 
 
-def size(median: float, factor: float) -> Prior:
+def size(median: float, factor: float, *, lowest: float = 0.0) -> Prior:
     """A positive number known to a factor, as one standard deviation; it ends four of them away.
 
     Args:
         median: of the ratio.
         factor: above 1.
+        lowest: least ratio that makes sense.
     """
     reach = factor**REACH
-    return Prior("log-normal", median, factor, median / reach, median * reach)
+    return Prior("log-normal", median, factor, max(lowest, median / reach), median * reach)
 
 
 ANGLE = Prior("uniform", 0.0, math.inf, -math.pi, math.pi)
