@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from gap_helpers import JOINT, SENSED, WALL, chain, drive, exact, noisy, record, with_effect
+from gap_helpers import DT, JOINT, SENSED, WALL, chain, drive, exact, noisy, record, with_effect
 
 from jaxsid.checks import InputError
 from jaxsid.gap.locate import locate
@@ -50,6 +50,16 @@ def test_place_is_found_with_one_sensor():
     assert len(found.likely) <= 2
     assert np.isnan(found.ranked[0].across)
     assert any("One sensor" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5])
+def test_an_input_late_by_part_of_a_sample_is_no_late_accelerometer(part):
+    """A held input is read a whole step late by an accelerometer where it acts, however little it is late."""
+    kinds = [(0, "acceleration")]
+    u, y = measured("input_delay", 0, {"delay": part * DT}, kinds)
+    found = locate(chain(kinds), record(u, y, kinds))
+    assert found.ranked[0].place == DRIVE
+    assert Place("sensor", ("s0",)) not in found.likely
 
 
 def test_delays_of_one_sensor_and_of_the_input_are_one_set():
