@@ -15,6 +15,7 @@ from jaxsid.mechanics.lumped import LumpedModel
 TELLS = 10.0  # log evidence below which an experiment is of no use
 PARTS = 0.01  # of a body's motion that a sensor is worth asking for
 NAMED = 6  # numbers that are off
+BY_ITSELF = "What enters by a sensor of its own: it tells an error of the input from all else."
 APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 
 
@@ -198,7 +199,7 @@ def next_experiment(found: Found) -> str:
             open_places = " or ".join(place_words(x.place) for x in open_ones[0])
             return f"A longer record, or one more sensor: only the place is open, {open_places}."
         if kinds & {"input_delay", "actuator_lag", "input_gain", "actuator_saturation"}:
-            return "What enters by a sensor of its own: it tells an error of the input from all else."
+            return BY_ITSELF
         if kinds & {"coulomb_friction", "stribeck_friction", "quadratic_damping"}:
             return (
                 "The same input at a third of its level, and a slow reversal: slow motion shows dry friction."
@@ -206,6 +207,8 @@ def next_experiment(found: Found) -> str:
         return "The same input at a third and at three times its level: how the force grows with it tells the law."
     if found.verdict != "unknown" and causes.places is None:
         return ""
+    if places is not None and any(place.where == "input" for place in places.likely):
+        return BY_ITSELF
     if places is not None and len(places.likely) > 1:
         ends = ", ".join(_place(place) for place in places.likely)
         return f"One more sensor, on a body that {ends} move differently."
