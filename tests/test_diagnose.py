@@ -76,7 +76,9 @@ def test_remarks_on_places_are_for_what_no_law_explains(cubic):
 
     def shown(verdict):
         judgement = cubic.judgement._replace(name=verdict)
-        return "of the place" in module._warnings(cubic.nominal, cubic.records, found, judgement, False)
+        return "of the place" in module._warnings(
+            cubic.nominal, cubic.records, found, cubic.causes, judgement, False
+        )
 
     assert [shown(x) for x in ("effect", "none", "unknown", "ambiguous")] == [False, False, True, True]
 

@@ -6,7 +6,7 @@ from gap_helpers import chain, drive, exact, noisy, record
 
 from jaxsid.gap.examine import examine
 from jaxsid.gap.numbers import off_numbers
-from jaxsid.gap.words import about_numbers
+from jaxsid.gap.words import about_numbers, percent
 from jaxsid.physical.elements import Element, ElementValues
 from jaxsid.records import as_array
 
@@ -73,3 +73,10 @@ def test_a_gain_alone_is_said_to_be_one():
 def test_a_good_model_is_not_talked_about():
     u = drive()
     assert about_numbers(examine(chain(), record(u, noisy(exact(u))))) == []
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(1.2379, "120 %"), (0.00022, "0.022 %"), (0.742, "74 %"), (0.0, "0 %")]
+)
+def test_shares_are_written_without_powers_of_ten(share, said):
+    assert percent(share) == said

@@ -66,6 +66,12 @@ class Diagnosis(NamedTuple):
         return self.examination.refit if nothing or self.causes is None else self.causes.chosen.model
 
     @property
+    def far_off(self) -> bool:
+        """Whether the places are those of a model with wrong numbers, no effect that was found being the reason."""
+        alone = self.causes is None or not self.causes.selected
+        return self.verdict != "none" and alone and self.examination.far_off
+
+    @property
     def closure(self) -> Closure | None:
         """How far the gap shrinks on held-out samples."""
         return None if self.causes is None else self.causes.closures[-1]
@@ -310,6 +316,8 @@ def _warnings(
         for record in records
         if not np.asarray(record.u).any()
     ]
+    if verdict.name != "none" and (causes is None or not causes.selected):
+        said += about_numbers(found)
     said += _about_sensors(model, found)
     if any(n.source == SOURCES[-1] for n in found.noises):
         said.append(
@@ -320,14 +328,13 @@ def _warnings(
     # what a law explains has its place by the law, not by the force alone
     if found.locations is not None and verdict.name in ("unknown", "ambiguous"):
         said += found.locations.remarks
-    if verdict.name != "none" and (causes is None or not causes.selected):
-        said += about_numbers(found)
     return tuple(said)
 
 
 def _about_sensors(model: LumpedModel, found: Examination) -> list[str]:
     """Responses that have nothing to do with what was measured, or the opposite sign."""
-    said = []
+    said: list[str] = []
+    useless, against = [], []
     for j, sensor in enumerate(model.sensors):
         y, response = (
             np.concatenate([getattr(x, name)[:, j] for x in found.beside]) for name in ("measured", "refit")
@@ -339,11 +346,14 @@ def _about_sensors(model: LumpedModel, found: Examination) -> list[str]:
             continue
         there = np.isfinite(y)
         together = float(np.corrcoef(y[there], response[there])[0, 1])
-        hint = (
-            " It moves against it: is its sign, or that of an input, reversed?" if together < REVERSED else ""
-        )
+        useless.append(f"'{sensor.name}'")
+        if together < REVERSED:
+            against.append(f"'{sensor.name}'")
+    if useless:
+        moves = f" {', '.join(against)} moves against the model" if against else ""
+        hint = f"{moves}: is a sign reversed, there or of an input?" if against else ""
         said.append(
-            f"Sensor '{sensor.name}': what the nominal model leaves is larger than the signal itself. Check its unit, "
+            f"Sensor {', '.join(useless)}: what the nominal model leaves is larger than the signal itself. Check unit, "
             f"place and kind, and the unit of the inputs.{hint}"
         )
     return said

@@ -67,7 +67,7 @@ def named(x: Explanation) -> str:
 
 def percent(x: float) -> str:
     """With two digits."""
-    return f"{100 * x:.2g} %"
+    return f"{float(f'{100 * x:.2g}'):g} %"
 
 
 def summary(found: Found) -> tuple[str, str]:
@@ -94,8 +94,13 @@ def summary(found: Found) -> tuple[str, str]:
     )
     if found.verdict == "unknown":
         likely = found.examination.locations
-        unsure = likely is None or found.examination.far_off
-        place = "" if unsure else f" Its place is most likely {_place(likely.ranked[0].place)}."
+        if found.examination.far_off and not causes.selected:
+            return (
+                "The model's numbers are far from these records, and no kind of effect in the catalogue explains what "
+                "is left with better ones.",
+                shrinks,
+            )
+        place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
         return f"The model lacks something that no kind of effect in the catalogue explains.{place}", shrinks
     if not causes.selected:
         return "The model's structure is right, its numbers are not.", shrinks

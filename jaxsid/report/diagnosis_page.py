@@ -203,7 +203,8 @@ def _where(found: Diagnosis) -> Section:
     if places is None:
         return Section("Where it arises", ())
     rows = tuple(_place_row(x, i == 0) for i, x in enumerate(places.ranked[:PLACES]))
-    note = (
+    doubt = "Not to be trusted: the nominal numbers are far from these records. " if found.far_off else ""
+    note = doubt + (
         "How well one force between two ends, or one error of a sensor or of an input, explains what the model leaves: "
         "a law of the motion there and a smooth process for what that misses, with errors of the linear numbers within "
         "their tolerance beside it. Across: what no force at this place could explain, in noise; about 1 at the right "

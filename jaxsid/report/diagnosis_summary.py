@@ -26,10 +26,10 @@ def print_diagnosis(found: Diagnosis, console: Console | None = None) -> None:
     console.print(escape(meaning))
     console.print(_gap(found))
     if found.examination.locations is not None:
-        console.print(_places(found.examination.locations))
+        console.print(_places(found.examination.locations, found.far_off))
     if found.causes is not None:
         console.print(_effects(found))
-    elif found.examination.before.total > APART:
+    if found.far_off or (found.causes is None and found.examination.before.total > APART):
         console.print(_numbers(found))
     console.print(escape(found.remaining))
     if found.next_experiment:
@@ -67,8 +67,9 @@ def _gap(found: Diagnosis):
     return made
 
 
-def _places(found: Locations):
-    made = table("Where it arises", "place", "probability", "not told apart from")
+def _places(found: Locations, far_off: bool):
+    doubt = ", were the nominal numbers right" if far_off else ""
+    made = table(f"Where it arises{doubt}", "place", "probability", "not told apart from")
     for x in found.ranked[:PLACES]:
         others = ", ".join(label_of(p) for p in x.together if p != x.place)
         made.add_row(escape(label_of(x.place)), share_of(x.probability), escape(others))
