@@ -21,6 +21,7 @@ HELD_OUT = 0.25  # part of the end of every record that nothing is fitted to
 PIECES = 40  # that what is left is cut into for the interval
 DRAWS = 2000  # of pieces
 ROUNDS = 8  # of the search for initial states
+CLEAR = 1.5  # a gap over the noise floor from which on more than noise is left
 
 
 class Left(NamedTuple):
@@ -71,6 +72,16 @@ class Closure(NamedTuple):
             "by_sensor": self.by_sensor,
             "noise_by_sensor": self.noise_by_sensor,
         }
+
+
+def substantial(gap: float, floor: float) -> bool:
+    """Whether a gap is clearly more than noise.
+
+    Args:
+        gap: NRMSE.
+        floor: that of noise alone.
+    """
+    return gap > CLEAR * floor
 
 
 def held_out_begin(record: Record) -> int:

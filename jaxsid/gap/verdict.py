@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsid.gap.causes import SLIGHT, Causes
-from jaxsid.gap.closure import fraction
+from jaxsid.gap.closure import fraction, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
@@ -82,8 +82,8 @@ def _unexplained(causes: Causes) -> float:
     last = causes.closures[-1]
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1.0
-    gone = last.against_recalibrated if _substantial(last.recalibrated, last.noise_floor) else last.fraction
-    enough = MORE if _substantial(last.after, last.noise_floor) else ENOUGH
+    gone = last.against_recalibrated if substantial(last.recalibrated, last.noise_floor) else last.fraction
+    enough = MORE if substantial(last.after, last.noise_floor) else ENOUGH
     return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
@@ -98,10 +98,6 @@ def _beside(causes: Causes) -> int:
             return count
         gap = closure.after
     return len(causes.selected)
-
-
-def _substantial(gap: float, floor: float) -> bool:
-    return gap > 1.5 * floor
 
 
 def _set(ranked: tuple[Explanation, ...]) -> tuple[Explanation, ...]:

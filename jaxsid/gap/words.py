@@ -3,8 +3,10 @@
 from typing import Any, Protocol, runtime_checkable
 
 from jaxsid.gap.causes import Causes
+from jaxsid.gap.closure import substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.experiment import Experiment
+from jaxsid.gap.locate import located
 from jaxsid.gap.measure import Gap
 from jaxsid.gap.numbers import off_numbers
 from jaxsid.gap.places import Place
@@ -35,6 +37,8 @@ class Found(Protocol):
     def experiment(self) -> Experiment | None: ...
     @property
     def verdict(self) -> str: ...
+    @property
+    def far_off(self) -> bool: ...
     def probability(self, x: Explanation) -> float: ...
     def selected(self) -> list[dict[str, Any]]: ...
 
@@ -94,7 +98,7 @@ def summary(found: Found) -> tuple[str, str]:
     )
     if found.verdict == "unknown":
         likely = found.examination.locations
-        if found.examination.far_off and not causes.selected:
+        if found.far_off:
             return (
                 "The model's numbers are far from these records, and no kind of effect in the catalogue explains what "
                 "is left with better ones.",
@@ -191,7 +195,7 @@ def next_experiment(found: Found) -> str:
     Args:
         found: the diagnosis.
     """
-    causes, places = found.causes, found.examination.locations
+    causes = found.causes
     if causes is None or found.verdict == "none":
         told = all(n.degrees > 0 for n in found.examination.noises)
         return "" if told else "A record with repeated periods, or a quiet start, would tell the noise apart."
@@ -210,16 +214,27 @@ def next_experiment(found: Found) -> str:
                 "The same input at a third of its level, and a slow reversal: slow motion shows dry friction."
             )
         return "The same input at a third and at three times its level: how the force grows with it tells the law."
-    if found.verdict != "unknown" and causes.places is None:
+    if found.verdict != "unknown" and not substantial(
+        causes.closures[-1].after, causes.closures[-1].noise_floor
+    ):
         return ""
-    if places is not None and any(place.where == "input" for place in places.likely):
+    places = _left_at(found)
+    if any(place.where == "input" for place in places):
         return BY_ITSELF
-    if places is not None and len(places.likely) > 1:
-        ends = ", ".join(_place(place) for place in places.likely)
+    if len(places) > 1:
+        ends = ", ".join(_place(place) for place in places)
         return f"One more sensor, on a body that {ends} move differently."
     return (
         "The same input at a third and at three times its level: how the force grows with it tells the law."
     )
+
+
+def _left_at(found: Found) -> tuple[Place, ...]:
+    """Where that may arise which the selected effects leave."""
+    causes = found.causes
+    if causes is not None and causes.selected:
+        return () if causes.places is None else located(causes.places).likely
+    return () if found.examination.locations is None else found.examination.locations.likely
 
 
 def _experiment(x: Experiment, likely: tuple[Explanation, ...]) -> str:
