@@ -1,4 +1,4 @@
-"""Balance of impulses on free bodies: noise alone gives what chance does, a steady force is found and measured."""
+"""Balance on free bodies: noise alone gives what chance does, steady forces and offsets are found and measured."""
 
 import numpy as np
 import pytest
@@ -58,9 +58,10 @@ def readings(model, force, seed=0, start=(0.1, -0.2, 0.3, 0.1)):
     return pushes[:, :1], np.array(y)
 
 
-def fitted(model, force, seed=0):
-    """The model refitted within its tolerance to a record with white noise of a known level."""
+def fitted(model, force, seed=0, offset=0.0):
+    """The model refitted within its tolerance to a record with white noise of a known level, the last sensor off."""
     u, y = readings(model, force, seed)
+    y[:, -1] += offset
     level = NOISE * np.ones(y.shape[1])
     y = y + level * np.random.default_rng(100 + seed).standard_normal(y.shape)
     data = Record(u, y, DT, inputs=("drive",), outputs=tuple(s.name for s in model.sensors))
@@ -76,7 +77,7 @@ def fitted(model, force, seed=0):
 )
 def test_noise_alone_gives_what_chance_does(model):
     fits = [fitted(model, 0.0, seed) for seed in range(16)]
-    statistics = [balance_of(x, x.settings).statistic for x in fits]
+    statistics = [balance_of(x, x.settings)[0].statistic for x in fits]
     # the mean of 16 squares of standard normal numbers: 1 +- 0.35
     assert 0.3 < np.mean(statistics) < 2.2
     assert max(statistics) < 12
@@ -89,11 +90,11 @@ def test_noise_alone_gives_what_chance_does(model):
 )
 def test_a_steady_force_is_found_and_measured(model):
     fit = fitted(model, 0.02)
-    (found,) = _steady(fit, fit.settings)
+    found = _steady(fit, fit.settings)[0]
     assert found.p_value < 1e-6
-    part = _missing(fit.settings[0], fit.linear[0], free_bodies(fit.model))
+    part = _missing(fit.settings[0], fit.linear[0], free_bodies(fit.model)).force
     deviation = np.sqrt(part.covariance + part.slopes @ fit.covariance @ part.slopes.T)[0, 0]
-    assert abs(part.force[0] - 0.02) < 4 * deviation < 0.01
+    assert abs(part.values[0] - 0.02) < 4 * deviation < 0.01
     assert null_test(fit, places_of(fit.model)).p_value < 1e-4
 
 
@@ -105,7 +106,42 @@ def test_its_share_is_that_of_what_it_does_to_the_sensors():
         ((change**2).sum(axis=0) / ((with_force - with_force.mean(axis=0)) ** 2).sum(axis=0)).mean()
     )
     fit = fitted(model, 0.05)
-    assert balance_of(fit, fit.settings).share == pytest.approx(expected, rel=0.05)
+    assert balance_of(fit, fit.settings)[0].share == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("model", "count"),
+    [
+        (axis(), 1),
+        (axis(drag=0.3), 1),
+        (axis((("b1", "displacement"), ("b2", "displacement"))), 1),
+        (axis(MIXED), 1),
+        (axis((("b2", "displacement"), *SPEEDS)), 2),
+        (axis((("b1", "velocity"),)), 0),
+    ],
+    ids=["speeds", "dragged", "displacements", "acceleration", "three", "one"],
+)
+def test_offsets_are_found_where_the_motion_cannot_take_them_up(model, count):
+    statistics = []
+    for seed in range(16):
+        fit = fitted(model, 0.0, seed)
+        means = balance_of(fit, fit.settings)[1]
+        assert means.count == count
+        statistics.append(means.statistic)
+    if not count:
+        assert len(_steady(fit, fit.settings)) == 1
+        return
+    assert 0.3 < np.mean(statistics) < 2.2
+    # of 1000 samples the mean of one sensor, or of two less each other, is known to a thirtieth or so of the noise
+    fit = fitted(model, 0.0, offset=0.5 * NOISE)
+    found = _steady(fit, fit.settings)[1]
+    assert found.p_value < 1e-6
+    part = _missing(fit.settings[0], fit.linear[0], free_bodies(fit.model))
+    # two alike share what is between them
+    alike = sum(s.name.split()[1] == model.sensors[-1].name.split()[1] for s in model.sensors)
+    expected = 0.5 * NOISE / (alike if count == 1 else 1)
+    assert abs(part.offsets[-1]) == pytest.approx(expected, rel=0.35)
+    assert null_test(fit, places_of(fit.model)).p_value < 1e-4
 
 
 def test_nothing_to_balance_where_bodies_are_held():

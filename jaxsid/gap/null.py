@@ -129,13 +129,14 @@ def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit
 
 
 def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
-    """An F test for steady forces on free bodies, where there are such."""
-    found = balance_of(fit, settings)
-    if found is None:
-        return []
+    """F tests for steady forces on free bodies and for offsets of sensors beside them, where there are such."""
     rest = max(fit.equations - len(fit.change) - sum(len(s.transient) for s in settings), 1)
-    p = float(betainc(rest / 2, found.count / 2, rest / (rest + found.count * found.statistic)))
-    return [Test("steady force on free bodies", p, found.share)]
+    names = "steady force on free bodies", "offset of sensors beside free bodies"
+    return [
+        Test(name, float(betainc(rest / 2, x.count / 2, rest / (rest + x.count * x.statistic))), x.share)
+        for name, x in zip(names, balance_of(fit, settings) or (), strict=False)
+        if x.count
+    ]
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:
