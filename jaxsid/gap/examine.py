@@ -21,7 +21,7 @@ from jaxsid.records import Record, as_array
 
 FAR = 10.0  # times less that a refit leaves, from which on the tolerance may be wrong
 NEARER = 2.0  # likewise, where the nominal model leaves more than there was
-NEGLIGIBLE = 0.002  # part of the response below which what was found is of no matter
+NEGLIGIBLE = 5e-4  # part of the response below which what was found is of no matter
 
 
 class Beside(NamedTuple):

@@ -28,6 +28,7 @@ from jaxsid.gap.ranking import (
     numbers_of,
     parsimonious,
     ranked,
+    straight,
     value,
     volume,
 )
@@ -51,13 +52,14 @@ TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
 MILD = 2.0  # of the model's numbers, whose equations are known
 ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
-HERE = 3  # other laws that are tried where the best rough one acts
+HERE = 3  # other laws that are tried where the best rough one acts, beside springs and dampers
 ELSEWHERE = 3  # other places that the best law is fitted thoroughly at, where it leaves more than noise
 PLAINER = 2  # laws of fewer numbers that are tried where the best one acts and leaves more than noise
 HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
+SPRING = "missing_connection"
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 
 
@@ -71,7 +73,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(10, 4, 25, TEMPERATURE), Effort(15, 3, 16, TEMPERATURE)
+FIRST, FURTHER = Effort(14, 4, 25, TEMPERATURE), Effort(15, 3, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 
@@ -124,11 +126,25 @@ def rank(
     base = before.hypothesis if before is not None else Hypothesis()
     bench = as_guessed(bench)
     without = refitted(bench, base, changes=_changes(before, bench)) if before is None else before
+    candidates = [*candidates, *_connections(bench.model, candidates[: effort.tried])]
     every = [
         (c, extended(base, c, errors), _changes(before, bench, c.changes))
         for c in _distinct(candidates, base, errors)
     ]
     return _round(bench, every, without, effort, progress or (lambda text: None))
+
+
+def _connections(model: LumpedModel, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Springs where candidates act between bodies that a model of connections does not join."""
+    if model.matrices is not None:
+        return []
+    joined = {tuple(sorted(c.between)) for c in model.connections}
+    places = {ends_of(c.place): c for c in candidates if "between" in c.place}
+    return [
+        Candidate(SPRING, c.place, {}, c.changes, 0.0, math.nan, "", {})
+        for (_, *ends), c in places.items()
+        if tuple(ends) not in joined
+    ]
 
 
 def rank_again(
@@ -300,11 +316,26 @@ def _round(
     best = range(min(effort.refined + len(done), len(rough)))
     due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]
     done |= dict(zip(due, side_by_side(thorough, due), strict=True))
-    while (values := _values(rough, done, bench, part)) and (i := int(np.argmax(values))) not in done:
-        if not math.isfinite(values[i]):
-            break
-        done[i] = thorough(i)
+    near = CLOSE * scale * effort.temperature
+    while due := _due(rough, values := _values(rough, done, bench, part), done, near):
+        done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     return _compared(rough, values, done, bench, without, effort)
+
+
+def _due(
+    rough: Sequence[tuple[Candidate, Refit]], values: Sequence[float], done: Mapping[int, Whole], near: float
+) -> list[int]:
+    """What must still be fitted thoroughly: the best one, then springs and dampers where it acts."""
+    if not rough or not math.isfinite(max(values)):
+        return []
+    best = int(np.argmax(values))
+    if best not in done:
+        return [best]
+    at, top = rough[best][0], values[best]
+    if straight(at.kind):
+        return []
+    here = (i for i, (c, _) in enumerate(rough) if i not in done and ends_of(c.place) == ends_of(at.place))
+    return [i for i in here if straight(rough[i][0].kind) and top - values[i] < near]
 
 
 def _roughly(
@@ -326,8 +357,10 @@ def _roughly(
 
     rough = side_by_side(begun, every[:tried])
     best = max(rough, key=lambda x: x[1].fit.evidence)[0].place if rough else {}
-    here = [x for x in every[tried:] if key_of("", x[0].place) == key_of("", best)] if best else []
-    rough += side_by_side(begun, here[:HERE])
+    here = [x for x in every[tried:] if ends_of(x[0].place) == ends_of(best)] if best else []
+    # a stop without play, or a stiffening spring that hardly stiffens, is a spring
+    bent = [x for x in here if not straight(x[0].kind)]
+    rough += side_by_side(begun, [x for x in here if straight(x[0].kind)] + bent[:HERE])
     for few, more in LONGER:
         rough.sort(key=lambda x: -value(x[1], part))
         most = HOPELESS * rough[0][1].fit.squares if rough else 0.0

@@ -21,6 +21,9 @@ from jaxsid.mechanics.effects.prior import Amplitudes, Prior
 
 COUNTS = {0: (), 1: (15,), 2: (15, 4), 3: (4, 3, 2)}  # points of each shape parameter, by how many there are
 RESONANCES = (61, 4)  # of stiffness and damping of what is attached: 8 % in frequency, for sharp ones too
+WAVES = (
+    91,
+)  # of the wavenumber of a wave along the way: 7 %, as an eighth of ten radians puts it out of step
 WIDTHS = (0.02, 0.1)  # of the smoothed sign of dry friction, next to the rms velocity
 LINEAR_CHANGES = ("mass", "damping", "stiffness", "gain", "offset")
 SIGNALS = (
@@ -178,7 +181,7 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
     """
     kind, plan = CATALOGUE[name], plan_of(name)
     several = COUNTS.get(len(plan.shape), (3,) + (2,) * (len(plan.shape) - 1))
-    counts = RESONANCES if plan.whole else several
+    counts = RESONANCES if plan.whole else several if plan.angle is None else WAVES
     axes = [
         hertz if i == plan.frequency else quantiles(kind.parameters[i].prior, count)
         for i, count in zip(plan.shape, counts, strict=True)

@@ -12,6 +12,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND
 
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
+STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ from them as they are
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
@@ -150,7 +151,8 @@ def value(found: Refit, bench: Bench) -> float:
 def sensible(found: Refit, bench: Bench) -> bool:
     """Whether each law has parameters that it is meant for, and that windows can tell.
 
-    A mode that is slower than a window is a force of its own in each, which explains anything.
+    A mode that is slower than a window is a force of its own in each, which explains anything; a disturbance that is
+    slower than the longest record is a drift.
 
     Args:
         found: a fit.
@@ -161,6 +163,9 @@ def sensible(found: Refit, bench: Bench) -> bool:
         kind = CATALOGUE[effect.kind]
         values = {p.name: float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters}
         if kind.sensible is not None and not kind.sensible(*values.values()):
+            return False
+        longest = max((len(m.y) * m.dt for m in bench.moved), default=math.inf)
+        if any(p.unit[0] == "Hz" and values[p.name] * longest < 1 for p in kind.parameters):
             return False
         if kind.vibrates is None or block is None:
             continue
@@ -179,6 +184,15 @@ def left_in(bench: Bench, whole: Whole) -> float:
     """
     fit = whole.refit.fit
     return math.sqrt(fit.squares / max(fit.equations, 1)) * math.exp(gauge(bench) - gauge(whole.bench))
+
+
+def straight(kind: str) -> bool:
+    """Whether a kind of effect is a spring or a damper between bodies.
+
+    Args:
+        kind: its name.
+    """
+    return CATALOGUE[kind].changes is not None and bool(CATALOGUE[kind].needs)
 
 
 def numbers_of(kind: str) -> int:
@@ -268,12 +282,14 @@ def ranked(
         bench: of the best one.
         temperature: of the round.
     """
-    every = sorted(every, key=lambda x: -x[2])
-    first = every[0][1].fit if every else without.fit
+    first = max(every, key=lambda x: x[2])[1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
     values = np.array([x[2] for x in every] + [without.fit.evidence]) / scale / temperature
+    values[:-1] += [STRAIGHT * straight(x[0].kind) for x in every]
+    order = np.argsort(-values[:-1], kind="stable")
+    every = [every[i] for i in order]
     weights = np.exp(values - values.max())
-    weights = weights / weights.sum()
+    weights = weights[[*order, -1]] / weights.sum()
     return Ranking(
         tuple(
             Explanation(c.kind, dict(c.place), r, e, float(w), left)

@@ -14,7 +14,8 @@ from jaxsid.gap.ranking import LOUD, Explanation, ends_of
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
-MORE = 0.7  # likewise, where much more than noise is left
+MORE = 0.85  # likewise, where more than noise is left
+SURE = 1.1  # what is left over the noise floor from which on that is so
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
@@ -62,7 +63,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if found.finding == "structure" and not causes.selected and _slight(found):
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
-    unexplained = _unexplained(causes)
+    unexplained = _unexplained(causes, found.finding == "structure")
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
@@ -77,13 +78,15 @@ def _slight(found: Examination) -> bool:
     return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
-def _unexplained(causes: Causes) -> float:
+def _unexplained(causes: Causes, structural: bool) -> float:
     """Probability that the law is not among those tried: by how much of the gap the best one leaves."""
     last = causes.closures[-1]
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1.0
-    gone = last.against_recalibrated if substantial(last.recalibrated, last.noise_floor) else last.fraction
-    enough = MORE if substantial(last.after, last.noise_floor) else ENOUGH
+    # what comes nearest to a law that is not there explains most of its gap, but not to the noise
+    more = structural and last.after > SURE * last.noise_floor
+    beyond = more or substantial(last.recalibrated, last.noise_floor)
+    gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
