@@ -40,6 +40,7 @@ from jaxsid.gap.refit import (
     changes_of,
     loudest,
     refitted,
+    resolved,
     tied,
     weighed_anew,
 )
@@ -383,6 +384,8 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
     search, linked = {"steps": effort.steps, "gain": FINE}, {"steps": LINKED, "gain": FINE}
     found = refitted(bench, hypothesis, **start, **search)
     bench, found = tied(bench, found, **linked)
+    if (finer := resolved(bench, found)) is not bench:
+        bench, found = finer, refitted(finer, found.hypothesis, **_from(found, finer), **search)
     if any(n.degrees <= 0 for n in bench.noises) and math.isfinite(found.fit.evidence):
         bench = weighed_anew(bench, found)
         found = refitted(bench, found.hypothesis, **_from(found, bench), **search)

@@ -40,6 +40,8 @@ LEAST_ELEMENT = -0.95
 JUMP = 0.02  # of the noise next to the signal: far less than a window tells of its states
 STEPS_A_PERIOD = 20.0  # of the quickest vibration
 MOST_SUBSTEPS = 8
+FINER, FINEST = 4, 32  # times as many where a law needs them, and the most there are
+UNRESOLVED = 0.05  # rms, in noise, of what shorter steps change from which on they are needed
 
 
 class Bench(NamedTuple):
@@ -55,7 +57,7 @@ class Bench(NamedTuple):
         wide: (e,) likewise, of elements that are wrong.
         still: (2 N,) standard deviations of initial states, far above what they are.
         records: how many there are.
-        substeps: steps for each sampling interval.
+        substeps: steps for each sampling interval; see `resolved`.
         noises: of each record, that the blocks are weighed by.
         guesses: what they were to begin with.
         jump: of a state from where a window ends to where the next begins, next to how large states are; infinite where
@@ -267,6 +269,30 @@ def in_windows(bench: Bench, found: Refit) -> list[Products]:
         found: the fit.
     """
     return products_of(found.shot, bench.blocks, found.fit.theta, found.fit.states, bench.substeps)
+
+
+def resolved(bench: Bench, found: Refit) -> Bench:
+    """The bench with steps so short that the kinks of a law are not missed by more than the noise hides.
+
+    Args:
+        bench: records.
+        found: a fit to all of it.
+    """
+    left = _in_noise(bench, found)
+    while bench.substeps < FINEST and np.isfinite(left).all():
+        finer = bench._replace(substeps=min(FINER * bench.substeps, FINEST))
+        now = _in_noise(finer, found)
+        if not np.sqrt(((now - left) ** 2).mean()) > UNRESOLVED:
+            return bench
+        bench, left = finer, now
+    return bench
+
+
+def _in_noise(bench: Bench, found: Refit) -> Float[np.ndarray, " values"]:
+    """What a fit leaves of all that is judged."""
+    parts = zip(bench.blocks, in_windows(bench, found), strict=True)
+    each = [(np.asarray(x.left) * np.asarray(b.weight))[:, b.lead :][_seen(b)] for b, x in parts]
+    return np.concatenate([np.zeros(0), *each])
 
 
 def loudest(bench: Bench, found: Refit) -> Bench:
