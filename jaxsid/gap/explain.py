@@ -365,7 +365,10 @@ def _roughly(
     for few, more in LONGER:
         rough.sort(key=lambda x: -value(x[1], part))
         most = HOPELESS * rough[0][1].fit.squares if rough else 0.0
-        due = [i for i, (_, r) in enumerate(rough[:few]) if not r.fit.settled and r.fit.squares < most]
+        top = key_of("", rough[0][0].place) if rough else None
+        here = [i for i, (c, _) in enumerate(rough) if key_of("", c.place) == top]
+        hopeful = [i for i, (_, r) in enumerate(rough[:few]) if r.fit.squares < most]
+        due = [i for i in sorted({*hopeful, *here}) if not rough[i][1].fit.settled]
         on = partial(_longer, part=part, steps=more)
         for i, r in zip(due, side_by_side(on, [rough[i][1] for i in due]), strict=True):
             rough[i] = rough[i][0], r
