@@ -26,7 +26,7 @@ from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, Noise, noise_of, residual_noise
 from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
-from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, ranked
+from jaxsid.gap.ranking import STRAIGHT, Explanation, Ranking, alike, key_of, ranked
 from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
@@ -160,6 +160,18 @@ def test_probabilities_are_tempered_evidences():
     ratio = found.ranked[1].probability / found.ranked[0].probability
     assert ratio == pytest.approx(math.exp(-50 / (2 * TEMPERATURE)))
     assert sum(x.probability for x in found.ranked) == pytest.approx(1)
+
+
+def test_a_spring_comes_before_a_law_that_hardly_differs_from_it():
+    kinds = [("end_stop", B12), ("missing_connection", B12), ("cubic_stiffness", B23)]
+    unit = TEMPERATURE  # of evidence, where the best one leaves noise
+    first = lambda lead: ranking(0.0, -lead * unit, -unit, kinds=kinds).ranked[0].kind  # noqa: E731
+    assert first(STRAIGHT - 0.1) == "missing_connection"
+    assert first(STRAIGHT + 0.1) == "end_stop"
+    found = ranking(0.0, -unit, kinds=kinds)
+    assert found.ranked[0].probability == pytest.approx(1 / (1 + np.exp(1 - STRAIGHT)))
+    # what it is worth to have an effect at all is told by evidence alone
+    assert found.gain == pytest.approx((-unit + 1e4) / TEMPERATURE)
 
 
 def test_no_effect_at_all_is_an_alternative_too():
@@ -307,9 +319,10 @@ def test_an_effect_that_a_later_one_makes_needless_is_left_out(two):
 # verdicts
 
 
-def examination(nominal=1e-9, structural=1e-9):
+def examination(nominal=1e-9, structural=1e-9, finding=None):
     given = dict.fromkeys(Examination._fields)
-    return Examination(**{**given, "nominal_p_value": nominal, "structural_p_value": structural})
+    said = {"nominal_p_value": nominal, "structural_p_value": structural, "finding": finding}
+    return Examination(**{**given, **said})
 
 
 def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
@@ -396,14 +409,18 @@ def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
     # what counts is the last closure
     two = causes(ranking(0.0, -500.0), ranking(0.0, -500.0), closures=[closure(0.2), closure(0.02)])
     assert verdict_of(examination(), two).name == "effect"
-    # where much more than noise is left, more must be gone
+    # where more than noise is left of what no linear model explains, more must be gone
     with_floor = lambda gap, floor: math.hypot(0.3 * gap, floor)  # noqa: E731
-    much, little = (
-        closure(with_floor(0.3, x), recalibrated=with_floor(1.0, x), floor=x) for x in (0.01, 0.1)
+    much, some, little = (
+        closure(with_floor(0.3, x), recalibrated=with_floor(1.0, x), floor=x) for x in (0.01, 0.1, 0.25)
     )
-    assert much.against_recalibrated == pytest.approx(little.against_recalibrated) == pytest.approx(0.7)
-    assert verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[much])).name == "unknown"
-    assert verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[little])).name == "effect"
+    structure = examination(finding="structure")
+    for one, name in ((much, "unknown"), (some, "unknown"), (little, "effect")):
+        assert one.against_recalibrated == pytest.approx(0.7)
+        assert verdict_of(structure, causes(ranking(0.0, -500.0), closures=[one])).name == name
+    most = closure(with_floor(0.1, 0.01), recalibrated=with_floor(1.0, 0.01), floor=0.01)
+    assert most.against_recalibrated == pytest.approx(0.9)
+    assert verdict_of(structure, causes(ranking(0.0, -500.0), closures=[most])).name == "effect"
     # where the best linear model leaves noise, what counts is the gap of the nominal one
     linear = closure(0.0101, recalibrated=0.0102)
     assert linear.against_recalibrated < 0.5

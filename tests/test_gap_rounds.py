@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gap_helpers import chain
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
 from jaxsid.gap import causes, explain
 from jaxsid.gap import ranking as ranking_of
 from jaxsid.gap.causes import _Found, _otherwise
-from jaxsid.gap.explain import HERE, TEMPERATURE, _roughly, extended
+from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
 from jaxsid.gap.ranking import LOUD, NUMBER, PIECES, Whole, ends_of, notable, parsimonious, ranked
 from jaxsid.gap.refit import Hypothesis
 
@@ -56,6 +57,36 @@ def test_further_laws_are_tried_where_the_best_one_acts(tried):
     here = [(k, ("b1", "b2")) for k in LAWS[1 : 1 + HERE]]
     assert fitted == [("backlash", ("b2", "b3")), ("stribeck_friction", ("b1", "b2")), *here]
     assert rough[0][0].kind == "stribeck_friction"
+
+
+def test_springs_are_tried_wherever_a_law_acts(tried):
+    candidates = [candidate("end_stop", B13), candidate("backlash", B23)]
+    candidates += [candidate(k, B13) for k in LAWS[1 : 1 + HERE]]
+    candidates += [candidate(k, B13) for k in ("coulomb_friction", "missing_connection")]
+    fitted, _ = tried(candidates, {("end_stop", ("b1", "b3")): -10.0}, 2)
+    assert ("missing_connection", ("b1", "b3")) in fitted
+    assert ("coulomb_friction", ("b1", "b3")) not in fitted
+
+
+def test_springs_are_candidates_where_the_model_joins_nothing():
+    laws = [candidate("end_stop", B13), candidate("end_stop", B12), candidate("sensor_lag", {"sensor": "s1"})]
+    assert [(c.kind, c.place) for c in _connections(chain(), laws)] == [("missing_connection", B13)]
+
+
+@pytest.mark.parametrize(
+    ("best", "values", "due"),
+    [
+        ("end_stop", [0.0, -30.0, -10.0], [1]),  # a spring near a stop at its place
+        ("end_stop", [0.0, -50.0, -10.0], []),  # far from it
+        ("missing_connection", [-10.0, 0.0, -10.0], []),  # the spring is the best one
+    ],
+)
+def test_springs_are_fitted_thoroughly_beside_a_law_that_is_not(best, values, due):
+    kinds = [("end_stop", B13), ("missing_connection", B13), ("missing_connection", B12)]
+    rough = [(candidate(*k), refit(v)) for k, v in zip(kinds, values, strict=True)]
+    done = {[k for k, _ in kinds].index(best): Whole(BENCH, refit(0.0))}
+    assert _due(rough, values, done, 40.0) == due
+    assert _due(rough, values, {}, 40.0) == [int(np.argmax(values))]
 
 
 def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):

@@ -20,7 +20,7 @@ from gap_helpers import (
 
 import jaxsid
 from jaxsid.gap.dictionary import columns
-from jaxsid.gap.grids import RESONANCES, WIDTHS, plan_of, quantiles
+from jaxsid.gap.grids import RESONANCES, WIDTHS, grid_of, plan_of, quantiles
 from jaxsid.gap.noise import noise_of
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, beside, recalibrated
@@ -29,6 +29,7 @@ from jaxsid.gap.screen import _rows, lone_frequencies, screen, unseen
 from jaxsid.gap.setting import element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import spectra_of, stacked
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.prior import Amplitudes
 from jaxsid.mechanics.lumped import Connection, Effect, Input, Sensor, lumped_model
 from jaxsid.physical.elements import element_matrices
 
@@ -148,6 +149,24 @@ def test_plans_say_how_parameters_enter():
     assert np.sqrt(stiffness[-1] / stiffness[0]) > 90
     for name in ("backlash", "sensor_delay", "actuator_lag", "actuator_saturation"):
         assert not plan_of(name).proportional
+
+
+def test_waves_are_so_close_that_none_between_two_is_missed():
+    """A wave that is out by a radian rms where it is ten long is still like the next one of the grid."""
+    moved = Amplitudes(*(np.ones(1) for _ in Amplitudes._fields))
+    grid = grid_of("cogging_ripple", moved, np.zeros(0))
+    row = [p.name for p in CATALOGUE["cogging_ripple"].parameters].index("wavenumber")
+    waves = np.unique(grid.base[0, :, row])
+    assert waves.min() <= 0.5
+    assert waves.max() > 30
+    assert np.diff(waves)[waves[1:] < 10].max() < 1
+    d = np.random.default_rng(0).standard_normal(2000)
+    for between in np.sqrt(waves[1:] * waves[:-1])[waves[1:] < 10]:
+        near = waves[np.argsort(np.abs(waves - between))[0]]
+        columns = np.stack([np.sin(near * d), np.cos(near * d)], axis=1)
+        left = np.sin(between * d + 0.4)
+        rest = left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
+        assert (rest**2).sum() < 0.25 * (left**2).sum()
 
 
 def screened(model, records, **more):
