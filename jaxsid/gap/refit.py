@@ -41,7 +41,9 @@ JUMP = 0.02  # of the noise next to the signal: far less than a window tells of 
 STEPS_A_PERIOD = 20.0  # of the quickest vibration
 MOST_SUBSTEPS = 8
 FINER, FINEST = 4, 32  # times as many where a law needs them, and the most there are
-UNRESOLVED = 0.05  # rms, in noise, of what shorter steps change from which on they are needed
+UNRESOLVED = (
+    0.05  # rms of what shorter steps change, in noise or next to what is left, from which on they are needed
+)
 
 
 class Bench(NamedTuple):
@@ -272,7 +274,7 @@ def in_windows(bench: Bench, found: Refit) -> list[Products]:
 
 
 def resolved(bench: Bench, found: Refit) -> Bench:
-    """The bench with steps so short that the kinks of a law are not missed by more than the noise hides.
+    """The bench with steps so short that the kinks of a law are not missed by more than hides in what is left.
 
     Args:
         bench: records.
@@ -282,7 +284,7 @@ def resolved(bench: Bench, found: Refit) -> Bench:
     while bench.substeps < FINEST and np.isfinite(left).all():
         finer = bench._replace(substeps=min(FINER * bench.substeps, FINEST))
         now = _in_noise(finer, found)
-        if not np.sqrt(((now - left) ** 2).mean()) > UNRESOLVED:
+        if not np.sqrt(((now - left) ** 2).mean()) > UNRESOLVED * max(1.0, np.sqrt((left**2).mean())):
             return bench
         bench, left = finer, now
     return bench

@@ -14,7 +14,7 @@ from jaxsid.gap.ranking import LOUD, Explanation, ends_of
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
-MORE = 0.85  # likewise, where more than noise is left
+MORE = 0.8  # likewise, where more than noise is left
 SURE = 1.1  # what is left over the noise floor from which on that is so
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
