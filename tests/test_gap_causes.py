@@ -26,7 +26,7 @@ from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, Noise, noise_of, residual_noise
 from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
-from jaxsid.gap.ranking import STRAIGHT, Explanation, Ranking, alike, key_of, ranked
+from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, ranked
 from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
@@ -160,18 +160,6 @@ def test_probabilities_are_tempered_evidences():
     ratio = found.ranked[1].probability / found.ranked[0].probability
     assert ratio == pytest.approx(math.exp(-50 / (2 * TEMPERATURE)))
     assert sum(x.probability for x in found.ranked) == pytest.approx(1)
-
-
-def test_a_spring_comes_before_a_law_that_hardly_differs_from_it():
-    kinds = [("end_stop", B12), ("missing_connection", B12), ("cubic_stiffness", B23)]
-    unit = TEMPERATURE  # of evidence, where the best one leaves noise
-    first = lambda lead: ranking(0.0, -lead * unit, -unit, kinds=kinds).ranked[0].kind  # noqa: E731
-    assert first(STRAIGHT - 0.1) == "missing_connection"
-    assert first(STRAIGHT + 0.1) == "end_stop"
-    found = ranking(0.0, -unit, kinds=kinds)
-    assert found.ranked[0].probability == pytest.approx(1 / (1 + np.exp(1 - STRAIGHT)))
-    # what it is worth to have an effect at all is told by evidence alone
-    assert found.gain == pytest.approx((-unit + 1e4) / TEMPERATURE)
 
 
 def test_no_effect_at_all_is_an_alternative_too():

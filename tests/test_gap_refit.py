@@ -16,8 +16,6 @@ from jaxsid.gap.hypothesis import FIXED, coordinates_of, parameter_rows, shifts_
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.ranking import density
 from jaxsid.gap.refit import (
-    FINEST,
-    UNRESOLVED,
     Hypothesis,
     Refit,
     _prior,
@@ -25,7 +23,6 @@ from jaxsid.gap.refit import (
     as_guessed,
     loudest,
     refitted,
-    resolved,
     shot_of,
     states_without,
     weighed_anew,
@@ -338,31 +335,6 @@ def test_evidence_is_against_what_is_not_needed():
     with_law = refitted(of, Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=1e3),)))
     assert 1 < refitted(of, Hypothesis()).fit.evidence - with_law.fit.evidence < 15
     assert abs(pull(with_law, "coefficient", 0.0)) < 3.5
-
-
-def left_in_noise(of, found):
-    each = products_of(found.shot, of.blocks, found.fit.theta, found.fit.states, of.substeps)
-    parts = zip(each, of.blocks, strict=True)
-    return np.concatenate(
-        [(np.asarray(x.left) * np.asarray(b.weight))[:, b.lead :].ravel() for x, b in parts]
-    )
-
-
-def test_steps_are_shorter_where_a_law_has_kinks():
-    y = truth(drive(), "backlash", JOINT, {"half_gap": 1e-5})
-    of = bench(y, 1e-4 * y.std(axis=0))
-    smooth = refitted(of, Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=1e3),)))
-    assert resolved(of, smooth) is of
-    play = refitted(of, Hypothesis((effect("backlash", ("b1", "b2"), half_gap=1e-5),)))
-    finer = resolved(of, play)
-    assert of.substeps < finer.substeps <= FINEST
-    # against far shorter steps, what is left differs by less than before
-    best = left_in_noise(of._replace(substeps=8 * FINEST), play)
-    apart = [np.sqrt(((left_in_noise(x, play) - best) ** 2).mean()) for x in (of, finer)]
-    assert apart[1] < apart[0] / 4
-    assert apart[0] > UNRESOLVED
-    diverged = refitted(of, Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=-1e9),)))
-    assert resolved(of, diverged) is of
 
 
 def test_a_start_that_diverges_has_no_evidence(cubic):

@@ -11,7 +11,7 @@ from jaxsid.gap import causes, explain
 from jaxsid.gap import ranking as ranking_of
 from jaxsid.gap.causes import _Found, _otherwise
 from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
-from jaxsid.gap.ranking import LOUD, NUMBER, PIECES, Whole, ends_of, notable, parsimonious, ranked
+from jaxsid.gap.ranking import LOUD, NUMBER, PIECES, STRAIGHT, Whole, ends_of, notable, parsimonious, ranked
 from jaxsid.gap.refit import Hypothesis
 
 B13 = {"between": ("b1", "b3")}
@@ -66,6 +66,18 @@ def test_springs_are_tried_wherever_a_law_acts(tried):
     fitted, _ = tried(candidates, {("end_stop", ("b1", "b3")): -10.0}, 2)
     assert ("missing_connection", ("b1", "b3")) in fitted
     assert ("coulomb_friction", ("b1", "b3")) not in fitted
+
+
+def test_a_spring_comes_before_a_law_that_hardly_differs_from_it():
+    kinds = [("end_stop", B12), ("missing_connection", B12), ("cubic_stiffness", B23)]
+    unit = TEMPERATURE  # of evidence, where the best one leaves noise
+    first = lambda lead: ranking(0.0, -lead * unit, -unit, kinds=kinds).ranked[0].kind  # noqa: E731
+    assert first(STRAIGHT - 0.1) == "missing_connection"
+    assert first(STRAIGHT + 0.1) == "end_stop"
+    found = ranking(0.0, -unit, kinds=kinds)
+    assert found.ranked[0].probability == pytest.approx(1 / (1 + np.exp(1 - STRAIGHT)))
+    # what it is worth to have an effect at all is told by evidence alone
+    assert found.gain == pytest.approx((-unit + 1e4) / TEMPERATURE)
 
 
 def test_springs_are_candidates_where_the_model_joins_nothing():
