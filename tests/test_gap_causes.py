@@ -63,14 +63,6 @@ def ranking(*evidences, without=-1e4, squares=1000.0, kinds=None):
 # keys and numbers
 
 
-def test_the_order_of_two_ends_does_not_count():
-    assert key_of("backlash", {"between": ("b1", "b2")}) == key_of("backlash", {"between": ["b2", "b1"]})
-    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("end_stop", {"between": ("b1", "b2")})
-    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("backlash", {"between": ("b1", "b3")})
-    assert key_of("constant_load", {"body": "x"}) != key_of("constant_load", {"sensor": "x"})
-    assert len({key_of("sensor_gain", {"sensor": "ab"}), key_of("sensor_gain", {"sensor": "ba"})}) == 2
-
-
 def parallel():
     """Two connections side by side between a and b."""
     return lumped_model(

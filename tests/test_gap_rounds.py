@@ -11,7 +11,18 @@ from jaxsid.gap import causes, explain
 from jaxsid.gap import ranking as ranking_of
 from jaxsid.gap.causes import _Found, _otherwise
 from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
-from jaxsid.gap.ranking import LOUD, NUMBER, PIECES, STRAIGHT, Whole, ends_of, notable, parsimonious, ranked
+from jaxsid.gap.ranking import (
+    LOUD,
+    NUMBER,
+    PIECES,
+    STRAIGHT,
+    Whole,
+    ends_of,
+    key_of,
+    notable,
+    parsimonious,
+    ranked,
+)
 from jaxsid.gap.refit import Hypothesis
 
 B13 = {"between": ("b1", "b3")}
@@ -66,6 +77,14 @@ def test_springs_are_tried_wherever_a_law_acts(tried):
     fitted, _ = tried(candidates, {("end_stop", ("b1", "b3")): -10.0}, 2)
     assert ("missing_connection", ("b1", "b3")) in fitted
     assert ("coulomb_friction", ("b1", "b3")) not in fitted
+
+
+def test_the_order_of_two_ends_does_not_count():
+    assert key_of("backlash", {"between": ("b1", "b2")}) == key_of("backlash", {"between": ["b2", "b1"]})
+    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("end_stop", {"between": ("b1", "b2")})
+    assert key_of("backlash", {"between": ("b1", "b2")}) != key_of("backlash", {"between": ("b1", "b3")})
+    assert key_of("constant_load", {"body": "x"}) != key_of("constant_load", {"sensor": "x"})
+    assert len({key_of("sensor_gain", {"sensor": "ab"}), key_of("sensor_gain", {"sensor": "ba"})}) == 2
 
 
 def test_a_spring_comes_before_a_law_that_hardly_differs_from_it():
