@@ -9,14 +9,11 @@ from gap_helpers import DT, SAMPLES, chain, drive, exact, record
 import jaxsid
 from jaxsid.gap import closure as module
 from jaxsid.gap.closure import (
-    HELD_OUT,
     Left,
     _run_on,
     closure_of,
     fraction,
-    held_out_begin,
     left_of,
-    seen_part,
 )
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
@@ -25,7 +22,6 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
 
 LONG = 2 * PIECE + 700
-HALF = SAMPLES // 4 * 3
 
 
 def effect(kind, place, **parameters):
@@ -160,21 +156,6 @@ def test_the_interval_covers(monkeypatch):
     assert np.mean(widths) < 0.1
 
 
-def test_a_quarter_is_held_out():
-    u = drive()
-    data = record(u, exact(u))
-    assert held_out_begin(data) == HALF == round((1 - HELD_OUT) * SAMPLES)
-    seen = seen_part(data)
-    np.testing.assert_array_equal(seen.y, data.y[:HALF])
-    np.testing.assert_array_equal(seen.u, data.u[:HALF])
-    assert (seen.inputs, seen.outputs, seen.hold, seen.name) == (
-        data.inputs,
-        data.outputs,
-        data.hold,
-        data.name,
-    )
-
-
 @pytest.mark.parametrize("windowed", [False, True])
 def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     """Its run goes on from the last window that was fitted, or begins anew in every window."""
@@ -183,7 +164,7 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     frozen = of._replace(tolerance=np.full(9, FIXED))
     data = record(u, y[:, :2], kinds=((0, ""), (1, "")))
     noise = known(np.append(level[:2], np.nan))
-    found = left_of(refitted(frozen, Hypothesis()), frozen, [data], windowed=windowed)
+    found = left_of(refitted(frozen, Hypothesis()), frozen, [data], [3 * SAMPLES], windowed=windowed)
     (left,), (measured,) = found
     assert left.shape == measured.shape == (SAMPLES, 3)
     assert np.isnan(left[:, 2]).all()
@@ -210,7 +191,7 @@ def test_windows_begin_anew():
     wrong = bench(y[:SAMPLES], level, u=u[:SAMPLES], model=chain(factor=1.05))
     frozen = wrong._replace(tolerance=np.full(9, FIXED))
     found = refitted(frozen, Hypothesis())
-    given = found, frozen, [record(u, y)]
+    given = found, frozen, [record(u, y)], [3 * SAMPLES]
     free, windows = (np.sqrt((left_of(*given, windowed=x).left[0] ** 2).mean(axis=0)) for x in (False, True))
     assert (windows < 0.98 * free).all()
     assert (windows > 2 * known(level).rms()).all()

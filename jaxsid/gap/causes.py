@@ -5,6 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
@@ -28,7 +29,7 @@ from jaxsid.gap.locate import Scored
 from jaxsid.gap.look import Look, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
-from jaxsid.gap.null import Null
+from jaxsid.gap.null import Null, left_share
 from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, notable, parsimonious
 from jaxsid.gap.refit import (
     Bench,
@@ -52,7 +53,8 @@ WORTH = 6.0  # tempered gain of evidence from which on a further effect is taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
-LEAST = 0.01  # and of all that is left
+LEAST = 0.01  # and of all that is left, or of a first effect MOSTLY what tests find
+MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
 AGAIN = 6  # others that an effect is compared with when it is asked again, of each sort
 FAR = 4.0  # times what an effect left when it was found, that others which left more are not asked again
@@ -141,9 +143,7 @@ def causes_of(
     if found.finding == "structure":
         at = _effects(start, model, seen, say)
     else:
-        values, nominal = np.asarray(found.elements.values), np.asarray(found.elements.nominal)
-        change = np.where(nominal != 0, values / np.where(nominal != 0, nominal, 1.0) - 1, 0.0)
-        within = refitted(start.bench, Hypothesis(), changes=change)
+        within = refitted(start.bench, Hypothesis(), changes=_found_changes(found))
         at = start._replace(before=within, look=start.look._replace(scored=None))
     at = _numbers(at, model, seen, say)
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
@@ -155,15 +155,16 @@ def causes_of(
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
     say("how far the gap shrinks")
-    lefts = partial(left_of, bench=bench, records=whole, windowed=is_free_or_unstable(model))
+    ends = [len(r.y) for r in seen]
+    lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
-    ends = lefts(refitted(frozen, Hypothesis())), lefts(linear)
+    before = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
     # what is left is noise where tests find nothing in it, else more than that
     told = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
     floor = tuple(map(no_louder, told, steps[-1].left))
-    *each, alone = (closure_of(*ends, x, floor, names) for x in (*steps, ends[1]))
+    *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
     return Causes(
         rounds,
         chosen,
@@ -176,8 +177,31 @@ def causes_of(
         floor,
         look.null,
         None if look.clear else look.scored,
-        ends,
+        before,
     )
+
+
+def linear_left(
+    model: LumpedModel, seen: Sequence[Record], whole: Sequence[Record], found: Examination
+) -> Left:
+    """What the best linear model leaves of held-out samples, where records agree with it otherwise.
+
+    Args:
+        model: nominal; its effects are left out.
+        seen: records without their held-out ends.
+        whole: records as they are.
+        found: examination of the former.
+    """
+    bench, ends = bench_of(model, seen, found.noises, found.fit), [len(r.y) for r in seen]
+    every = Hypothesis(wrong=tuple(range(len(bench.tolerance))))
+    linear = refitted(bench, every, changes=_found_changes(found))
+    return left_of(linear, bench, whole, ends, windowed=is_free_or_unstable(model))
+
+
+def _found_changes(found: Examination) -> Float[np.ndarray, " e"]:
+    """Relative changes of the elements of the best linear model."""
+    values, nominal = np.asarray(found.elements.values), np.asarray(found.elements.nominal)
+    return np.where(nominal != 0, values / np.where(nominal != 0, nominal, 1.0) - 1, 0.0)
 
 
 class _Found(NamedTuple):
@@ -294,7 +318,7 @@ def _further(
 ) -> _Found:
     """With one effect more, if any is worth it, and what is left then."""
     ranking = rank(at.bench, candidates, at.before, effort, say)
-    if not ranking.ranked or not _worth(ranking):
+    if not ranking.ranked or not _worth(ranking, LEAST if at.selected else _least(at.look)):
         return at.refused(ranking)
     say("what is left")
     found = _left(at.taken(ranking), model, seen)
@@ -437,10 +461,16 @@ def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
     return (linear.fit.evidence - chosen.fit.evidence) / scale > WORTH
 
 
-def _worth(ranking: Ranking) -> bool:
-    """Whether the best further candidate explains much of what was left."""
+def _least(look: Look) -> float:
+    """Part of all that is left that a first effect must remove: tests may be certain of little, too."""
+    part = (look.null.share / max(left_share(look.fit), np.finfo(float).tiny)) ** 2
+    return min(LEAST, MOSTLY * part)
+
+
+def _worth(ranking: Ranking, least: float) -> bool:
+    """Whether the best further candidate explains much of what was left, and at least a part of all of it."""
     best, without = ranking.ranked[0], ranking.without.fit
     above = without.squares - without.equations
     # of windows that lead to one another what is missed shows where they meet, too
     less = 2 * (best.evidence - without.evidence)
-    return ranking.gain > WORTH and less > max(LESS * above, LEAST * without.squares)
+    return ranking.gain > WORTH and less > max(LESS * above, least * without.squares)

@@ -17,7 +17,6 @@ from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.records import Record
 
-HELD_OUT = 0.25  # part of the end of every record that nothing is fitted to
 PIECES = 40  # that what is left is cut into for the interval
 DRAWS = 2000  # of pieces
 ROUNDS = 8  # of the search for initial states
@@ -84,39 +83,22 @@ def substantial(gap: float, floor: float) -> bool:
     return gap > CLEAR * floor
 
 
-def held_out_begin(record: Record) -> int:
-    """The first sample of a record that is held out."""
-    return round((1 - HELD_OUT) * len(record.y))
-
-
-def seen_part(record: Record) -> Record:
-    """A record without its held-out end."""
-    end = held_out_begin(record)
-    return Record(
-        record.u[:end],
-        record.y[:end],
-        record.dt,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        hold=record.hold,
-        name=record.name,
-    )
-
-
 @step
-def left_of(found: Refit, bench: Bench, records: Sequence[Record], *, windowed: bool) -> Left:
+def left_of(
+    found: Refit, bench: Bench, records: Sequence[Record], ends: Sequence[int], *, windowed: bool
+) -> Left:
     """What a fitted model leaves of held-out samples, running on from the last state that was fitted before them.
 
     Args:
         found: model.
         bench: that it was fitted to.
         records: whole.
+        ends: samples of each that were seen.
         windowed: whether every window begins anew from the state that suits it, for models that drift away.
     """
-    begin = [held_out_begin(r) for r in records]
-    blocks = blocks_of(bench.model, records, bench.noises, _length(bench), begin)
+    blocks = blocks_of(bench.model, records, bench.noises, _length(bench), ends)
     left, measured = [], []
-    for number, (record, first) in enumerate(zip(records, begin, strict=True)):
+    for number, (record, first) in enumerate(zip(records, ends, strict=True)):
         own = [b for b in blocks if int(b.record[0]) == number]
         count = len(record.y) - first
         y = np.concatenate([_judged(b, b.y) for b in own])[:count]

@@ -7,11 +7,12 @@ import numpy as np
 
 from jaxsid.checks import require
 from jaxsid.compilation import release_programs
-from jaxsid.gap.causes import Causes, causes_of
-from jaxsid.gap.closure import Closure, seen_part
+from jaxsid.gap.causes import Causes, causes_of, linear_left
+from jaxsid.gap.closure import Closure
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.experiment import Experiment, experiment_between
 from jaxsid.gap.explain import ERRORS, element_place, elements_by_key
+from jaxsid.gap.held_out import later_ends, seen_part, usual_end
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
@@ -264,16 +265,45 @@ def diagnose(
     require(initial in ("estimate", "rest"), f"initial '{initial}' is unknown; choose 'estimate' or 'rest'.")
     records = (records,) if isinstance(records, Record) else tuple(records)
     release_programs()  # those of systems of other sizes, should there be very many
-    seen = tuple(seen_part(r) for r in records)
-    found = examine(model, seen, progress=progress)
-    causes = (
-        causes_of(model, seen, records, found, progress=progress) if found.finding != "agreement" else None
-    )
-    causes, verdict = concluded(found, causes)
+    ends = tuple(map(usual_end, records))
+    seen = tuple(map(seen_part, records, ends))
+    found, causes, verdict = _judged(model, seen, records, progress)
+    if verdict.name in ("none", "unknown") and (later := _later(model, seen, records, found, causes)) != ends:
+        if progress is not None:
+            progress("the last samples hold far more than all before: again with most of those")
+        seen = tuple(map(seen_part, records, later))
+        found, causes, verdict = _judged(model, seen, records, progress)
     said = _warnings(model, seen, found, causes, verdict, initial == "rest")
     return Diagnosis(
         model, records, found, causes, verdict, _experiment(model, seen, causes, verdict, progress), said
     )
+
+
+def _judged(
+    model: LumpedModel,
+    seen: tuple[Record, ...],
+    whole: tuple[Record, ...],
+    progress: Callable[[str], None] | None,
+) -> tuple[Examination, Causes | None, Verdict]:
+    """What records say, some samples at the end of each held out."""
+    found = examine(model, seen, progress=progress)
+    causes = None
+    if found.finding != "agreement":
+        causes = causes_of(model, seen, whole, found, progress=progress)
+    return found, *concluded(found, causes)
+
+
+def _later(
+    model: LumpedModel,
+    seen: tuple[Record, ...],
+    whole: tuple[Record, ...],
+    found: Examination,
+    causes: Causes | None,
+) -> tuple[int, ...]:
+    """How many samples of each record must be seen to know what is there."""
+    before = [x.refit - x.measured for x in found.beside]
+    after = linear_left(model, seen, whole, found) if causes is None else causes.before[1]
+    return later_ends(whole, [len(r.y) for r in seen], before, after.left)
 
 
 def _experiment(

@@ -103,5 +103,5 @@ def looked(model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refi
     base = with_values(bench.model, jnp.asarray(nominal * (1 + change)))
     records = deflated(seen, bench, found)
     fit = recalibrated(base, records, bench.noises, wide=True, given=True)
-    look = Look(fit, null_test(fit, places_of(base)), None)
+    look = Look(fit, null_test(fit, places_of(base), deflated=True), None)
     return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))

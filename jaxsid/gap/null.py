@@ -16,6 +16,7 @@ from jax.scipy.special import betainc, gammaincc
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
+from jaxsid.gap.innovations import coherence, innovations, unsteadiness
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
 from jaxsid.gap.recalibrate import Linear, Recalibrated
@@ -25,6 +26,8 @@ from jaxsid.gap.spectra import Motion
 from jaxsid.impulse.lines import line_level
 
 SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
+DOUBT = 0.05  # likewise, from which on nothing speaks for it either
+COMMON, CHANGE = "common to sensors", "change with time"
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
@@ -57,18 +60,27 @@ class Null(NamedTuple):
     share: float
     tests: tuple[Test, ...]
 
+    @property
+    def own(self) -> bool:
+        """Whether nothing speaks against noise of each sensor's own, where there are several, the same throughout."""
+        p = {t.name: t.p_value for t in self.tests}
+        return p.get(COMMON, 0.0) > DOUBT and p.get(CHANGE, 0.0) > DOUBT
 
-def null_test(fit: Recalibrated, places: Sequence[Place]) -> Null:
+
+def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = False) -> Null:
     """Whether a refitted model leaves noise alone.
 
     Args:
         fit: the model and what it leaves.
         places: where effects are looked for.
+        deflated: whether effects were taken out of the records: what their numbers miss is neither each sensor's own
+            nor the same throughout, so that neither is asked.
 
     Source: S. Holm, Scand. J. Statistics 6 (1979).
     """
     leveled = tuple(_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True))
     tests = [*_laws(fit, leveled, tuple(places)), _lone_line(fit), *_steady(fit, leveled)]
+    tests += [] if deflated else _own(fit, leveled)
     if all(n.degrees > 0 for n in fit.noises):
         tests.append(_power(fit))
     worst = min(tests, key=lambda t: t.p_value)
@@ -137,6 +149,14 @@ def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
         for name, x in zip(names, balance_of(fit, settings) or (), strict=False)
         if x.count
     ]
+
+
+def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
+    """Whether what is left is each sensor's own, where there are several, and the same throughout."""
+    white = [innovations(s, x) for s, x in zip(settings, fit.linear, strict=True)]
+    found = [(COMMON, coherence(white))] if any(e.shape[1] > 1 for e in white) else []
+    found.append((CHANGE, unsteadiness(white)))
+    return [Test(name, p, float(np.sqrt(part)) * left_share(fit)) for name, (p, part) in found]
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:

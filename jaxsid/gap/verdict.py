@@ -1,6 +1,7 @@
 """What is concluded from explanations that were fitted: whether they explain enough, and which cannot be told apart."""
 
 import math
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
 from jaxsid.gap.ranking import LOUD, Explanation, ends_of
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
@@ -18,6 +20,8 @@ MORE = 0.8  # likewise, where more than noise is left
 SURE = 1.1  # what is left over the noise floor from which on that is so
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
+IMITATED = 0.6  # probability that two such springs at one place stand for one that is not in the catalogue
+POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
 
 
@@ -28,11 +32,13 @@ class Verdict(NamedTuple):
         name: "none", "effect", "ambiguous" or "unknown".
         probability: of none, of an effect of the catalogue, of one that is not in it.
         likely: for each effect that was found, the explanations that are not told apart, most probable first.
+        imitating: effects of the catalogue that together look like one that is not in it.
     """
 
     name: str
     probability: dict[str, float]
     likely: tuple[tuple[Explanation, ...], ...]
+    imitating: tuple[Explanation, ...] = ()
 
 
 def concluded(found: Examination, causes: Causes | None) -> tuple[Causes | None, Verdict]:
@@ -63,18 +69,22 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if found.finding == "structure" and not causes.selected and _slight(found):
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
-    unexplained = _unexplained(causes, found.finding == "structure")
+    imitating = _imitating(causes.selected)
+    unexplained = max(_unexplained(causes, found.finding == "structure"), IMITATED if imitating else 0.0)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
-        return Verdict("unknown", probability, likely)
+        return Verdict("unknown", probability, likely, imitating)
     open_ones = any(len(x) > 1 for x in likely)
     return Verdict("ambiguous" if open_ones else "effect", probability, likely)
 
 
 def _slight(found: Examination) -> bool:
-    """Whether what tests find is small beside the noise, so that no law could be told from it."""
-    noisy = found.fit.squares < LOUD**2 * found.fit.equations
+    """Whether what tests find is small beside the noise, so that no law could be told from it.
+
+    Noise is what is left where it is not loud, or each sensor's own and steady, however low its level was guessed.
+    """
+    noisy = found.fit.squares < LOUD**2 * found.fit.equations or found.null.own
     return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
@@ -88,6 +98,17 @@ def _unexplained(causes: Causes, structural: bool) -> float:
     beyond = more or substantial(last.recalibrated, last.noise_floor)
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
+
+
+def _imitating(selected: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
+    """Two springs that are not straight at one place: more often one curve of neither's shape than both at once."""
+    springs = [x for x in selected if CATALOGUE[x.kind].restoring]
+    pairs = (
+        (x, y)
+        for x, y in combinations(springs, 2)
+        if ends_of(x.place) == ends_of(y.place) and {x.kind, y.kind} != POLYNOMIAL
+    )
+    return next(pairs, ())
 
 
 def _beside(causes: Causes) -> int:

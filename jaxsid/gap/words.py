@@ -105,7 +105,12 @@ def summary(found: Found) -> tuple[str, str]:
                 shrinks,
             )
         place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
-        return f"The model lacks something that no kind of effect in the catalogue explains.{place}", shrinks
+        both = " and ".join(map(named, found.judgement.imitating))
+        told = f" Together, {both} imitate it." if both else ""
+        return (
+            f"The model lacks something that no kind of effect in the catalogue explains.{place}{told}",
+            shrinks,
+        )
     if not causes.selected:
         return "The model's structure is right, its numbers are not.", shrinks
     what = " and ".join(_sentence(found, i) for i in range(len(causes.selected)))

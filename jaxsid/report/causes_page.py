@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsid.gap.closure import HELD_OUT, Closure, Left
+from jaxsid.gap.closure import Closure, Left
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import elements_by_key
 from jaxsid.gap.ranking import key_of
@@ -191,10 +191,18 @@ def before_after_section(found: Diagnosis) -> Section:
             )
         )
     told = Text(
-        f"The last {percent(HELD_OUT)} of every record: nothing was chosen or fitted with them, but for the motion "
+        f"The last {_held_out(found)} of every record: nothing was chosen or fitted with them, but for the motion "
         "at their start."
     )
     return Section("Before and after", (told, Gallery(tuple(pictures))) if pictures else ())
+
+
+def _held_out(found: Diagnosis) -> str:
+    """Part of the records that is held out."""
+    assert found.causes is not None
+    parts = zip(found.causes.lefts[-1].left, found.records, strict=True)
+    each = list(dict.fromkeys(percent(len(left) / len(r.y)) for left, r in parts))
+    return " or ".join(each)
 
 
 def closure_section(found: Diagnosis) -> Section:
@@ -220,7 +228,7 @@ def closure_section(found: Diagnosis) -> Section:
     rows.append(_closure_row(floor, closure.noise_floor, closure.noise_by_sensor, names))
     low, high = closure.ci95
     note = (
-        f"NRMSE on the last {percent(HELD_OUT)} of every record. Of the nominal model's gap above the noise "
+        f"NRMSE on the last {_held_out(found)} of every record. Of the nominal model's gap above the noise "
         f"{percent(closure.fraction)} is gone (95 %: {percent(low)} to {percent(high)}); {_next_to_linear(closure)}. "
         "Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
         "before, a after and n the noise."

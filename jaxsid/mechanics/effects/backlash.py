@@ -19,5 +19,6 @@ EFFECT = Kind(
     about="Gears, couplings and worn joints move freely within a gap before their spring takes hold.",
     source="M. Nordin and P.-O. Gutman, Automatica 38 (2002).",
     force=_force,
+    restoring=True,
     needs="joined",
 )

@@ -19,4 +19,5 @@ EFFECT = Kind(
     about="A crack that closes, a chain, a belt, a one-sided support.",
     source="K. Worden and G. R. Tomlinson, Nonlinearity in Structural Dynamics, 2001.",
     force=_force,
+    restoring=True,
 )

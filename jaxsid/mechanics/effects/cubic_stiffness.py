@@ -18,4 +18,5 @@ EFFECT = Kind(
     about="Membranes, clamped beams and rubber stiffen as they are stretched; buckled parts soften.",
     source="K. Worden and G. R. Tomlinson, Nonlinearity in Structural Dynamics, 2001.",
     force=_force,
+    restoring=True,
 )

@@ -23,4 +23,5 @@ EFFECT = Kind(
     about="A part that reaches a bumper, a neighbour or the end of its travel.",
     source="S. W. Shaw and P. J. Holmes, J. Sound Vib. 90 (1983).",
     force=_force,
+    restoring=True,
 )

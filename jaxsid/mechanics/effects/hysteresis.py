@@ -34,6 +34,7 @@ EFFECT = Kind(
     about="Wire ropes, rubber, joints that slip a little: the force lags behind, as a loop of some width.",
     source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976).",
     force=_force,
+    restoring=True,
     rate=_rate,
     sensible=_sensible,
     states=1,

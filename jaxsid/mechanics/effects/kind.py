@@ -120,6 +120,7 @@ class Kind(NamedTuple):
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
         vibrates: rad/s at which a part of its own swings, from its parameters in their order.
         steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
+        restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
     """
 
     name: str
@@ -137,6 +138,7 @@ class Kind(NamedTuple):
     needs: Literal["", "joined", "apart"] = ""
     vibrates: Callable[..., float] | None = None
     steady: bool = False
+    restoring: bool = False
 
 
 def power(x: Array, exponent: Array) -> Array:

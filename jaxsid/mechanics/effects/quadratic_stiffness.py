@@ -18,4 +18,5 @@ EFFECT = Kind(
     about="A preloaded or sagging spring, a curved part: stiffer one way, softer the other.",
     source="K. Worden and G. R. Tomlinson, Nonlinearity in Structural Dynamics, 2001.",
     force=_force,
+    restoring=True,
 )

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsid.gap.closure import held_out_begin
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.noise import Noise
 from jaxsid.mechanics.units import units_of
@@ -69,7 +68,7 @@ def held_out(found: Diagnosis, sensor: str, record: int) -> HeldOut:
     row = [s.name for s in found.nominal.sensors].index(sensor)
     measured = causes.lefts[-1].measured[record][:, row]
     nominal, chosen = (measured + x.left[record][:, row] for x in (causes.before[0], causes.lefts[-1]))
-    time = (held_out_begin(given) + np.arange(len(measured))) * float(given.dt)
+    time = (len(given.y) - len(measured) + np.arange(len(measured))) * float(given.dt)
     return HeldOut(time, measured, nominal, chosen, causes.noises[record], row, float(given.dt))
 
 

@@ -1,0 +1,199 @@
+"""What is concluded from explanations that were fitted: verdict, sets, what of them stands."""
+
+import math
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_gap_causes import B12, B23, ranking, refit
+
+from jaxsid.gap import null
+from jaxsid.gap.causes import SLIGHT, Causes
+from jaxsid.gap.closure import Closure, Left, fraction
+from jaxsid.gap.examine import Examination
+from jaxsid.gap.explain import TEMPERATURE
+from jaxsid.gap.noise import Noise
+from jaxsid.gap.places import Place
+from jaxsid.gap.recalibrate import Recalibrated
+from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, Verdict, concluded, verdict_of
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.kind import Motion
+
+
+def examination(nominal=1e-9, structural=1e-9, finding=None):
+    given = dict.fromkeys(Examination._fields)
+    said = {"nominal_p_value": nominal, "structural_p_value": structural, "finding": finding}
+    return Examination(**{**given, **said})
+
+
+def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
+    ends = fraction(before, after, floor), (0.0, 1.0), fraction(recalibrated, after, floor)
+    return Closure(before, recalibrated, after, floor, *ends, {}, {})
+
+
+def causes(*rounds, closures):
+    chosen = [r.ranked[0] for r in rounds][: len(closures)]
+    last = chosen[-1].refit
+    nothing = Left((), ())
+    linear = closure(0.3)
+    lefts = tuple(nothing for _ in closures)
+    ends = nothing, Left((np.ones((1, 1)),), ())
+    best = refit(0.0)
+    return Causes(
+        rounds, last, tuple(chosen), last, best, tuple(closures), lefts, linear, (), None, None, ends
+    )
+
+
+def test_none():
+    found = verdict_of(examination(0.4, 0.6), None)
+    assert (found.name, found.likely) == ("none", ())
+    assert found.probability["none"] > 0.99
+    assert sum(found.probability.values()) == pytest.approx(1)
+    doubtful = verdict_of(examination(0.006, 0.6), None)
+    assert 0.5 < doubtful.probability["none"] < 0.6
+
+
+def test_noise_that_was_guessed_is_a_bound_where_more_than_noise_is_left():
+    told = Noise(np.ones(3), np.ones((3, 1)), 500.0, "periods")
+    guess = Noise(told.level, told.taps, 0.0, "residual")
+    found = causes(ranking(0.0), closures=[closure(0.1)])
+    somewhere = SimpleNamespace()
+    assert found._replace(noises=(told, guess), places=somewhere).most == "at most "
+    assert found._replace(noises=(told, guess), places=None).most == ""
+    assert found._replace(noises=(told, told), places=somewhere).most == ""
+
+
+def test_what_is_far_above_the_noise_is_never_none(monkeypatch):
+    # causes that chose nothing, and tests whose share is small beside what is left
+    monkeypatch.setattr("jaxsid.gap.verdict.left_share", lambda fit: 0.1)
+    fit = Recalibrated(None, *(np.zeros(1),) * 3, (), (), (), 0.0, 1000)
+    tried = causes(ranking(0.0, -1.0), closures=[closure(0.29)])._replace(selected=())
+    verdict = {}
+    for rms in (0.99 * LOUD, 1.01 * LOUD):
+        left = fit._replace(squares=rms**2 * fit.equations)
+        found = examination()._replace(
+            finding="structure", fit=left, null=null.Null(1e-9, 0.1 * 0.9 * SLIGHT, ())
+        )
+        verdict[rms > LOUD] = verdict_of(found, tried).name
+    assert verdict == {False: "none", True: "unknown"}
+    marks = tuple(null.Test(name, 0.5, 0.0) for name in (null.COMMON, null.CHANGE))  # of noise
+    for tests, said in (marks, "none"), (marks[1:], "unknown"):
+        assert verdict_of(found._replace(null=found.null._replace(tests=tests)), tried).name == said
+
+
+def test_effect():
+    found = verdict_of(examination(), causes(ranking(0.0, -200.0), closures=[closure(0.012)]))
+    assert found.name == "effect"
+    assert [[x.kind for x in likely] for likely in found.likely] == [["cubic_stiffness"]]
+    assert found.probability["effect"] == pytest.approx(1 - LAPSE, abs=5e-3)
+    assert sum(found.probability.values()) == pytest.approx(1)
+
+
+def test_ambiguous_names_as_many_as_have_nine_tenths():
+    level = [TEMPERATURE * math.log(p) for p in (0.5, 0.3, 0.15, 0.05)]
+    found = verdict_of(examination(), causes(ranking(*level), closures=[closure(0.012)]))
+    assert found.name == "ambiguous"
+    assert [x.kind for x in found.likely[0]] == ["cubic_stiffness", "backlash", "end_stop"]
+    assert found.likely[0][0].probability == pytest.approx(0.5, abs=1e-6)
+
+
+def test_one_doubtful_effect_of_two_makes_it_ambiguous():
+    there = [("hysteresis", B23), ("backlash", B23)]
+    sure, open_one = ranking(0.0, -500.0), ranking(0.0, -5.0, kinds=there)
+    refused = ranking(0.0, -1.0)
+    given = [closure(0.1), closure(0.012)]
+    found = verdict_of(examination(), causes(sure, open_one, refused, closures=given))
+    assert found.name == "ambiguous"
+    assert [len(x) for x in found.likely] == [1, 2]
+    again = verdict_of(
+        examination(), causes(sure, ranking(0.0, -500.0, kinds=there), open_one, closures=given)
+    )
+    assert again.name == "effect"
+
+
+def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
+    found = verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[closure(0.2)]))
+    assert found.name == "unknown"
+    assert found.probability["unknown"] > 0.95
+    # what counts is the last closure
+    there = ranking(0.0, -500.0, kinds=[("hysteresis", B23), ("backlash", B23)])
+    two = causes(ranking(0.0, -500.0), there, closures=[closure(0.2), closure(0.02)])
+    assert verdict_of(examination(), two).name == "effect"
+    # where more than noise is left of what no linear model explains, more must be gone
+    with_floor = lambda gap, floor: math.hypot(0.3 * gap, floor)  # noqa: E731
+    much, some, little = (
+        closure(with_floor(0.3, x), recalibrated=with_floor(1.0, x), floor=x) for x in (0.01, 0.1, 0.25)
+    )
+    structure = examination(finding="structure")
+    for one, name in ((much, "unknown"), (some, "unknown"), (little, "effect")):
+        assert one.against_recalibrated == pytest.approx(0.7)
+        assert verdict_of(structure, causes(ranking(0.0, -500.0), closures=[one])).name == name
+    most = closure(with_floor(0.1, 0.01), recalibrated=with_floor(1.0, 0.01), floor=0.01)
+    assert most.against_recalibrated == pytest.approx(0.9)
+    assert verdict_of(structure, causes(ranking(0.0, -500.0), closures=[most])).name == "effect"
+    # where the best linear model leaves noise, what counts is the gap of the nominal one
+    linear = closure(0.0101, recalibrated=0.0102)
+    assert linear.against_recalibrated < 0.5
+    assert verdict_of(examination(), causes(ranking(0.0), closures=[linear])).name == "effect"
+
+
+@pytest.mark.parametrize(
+    ("left_at", "gaps", "kept"),
+    [
+        (Place("between", ("b2", "b3")), (0.1, 0.09), 1),  # the second stands in for what is there
+        (Place("between", ("b3", "b1")), (0.1, 0.09), 1),  # and the second explains little of what was left
+        (Place("between", ("b3", "b1")), (0.14, 0.06), 2),
+        (Place("between", ("b2", "b1")), (0.1, 0.09), 0),
+        (Place("sensor", ("s1",)), (0.2, 0.09), 0),
+        (None, (0.1, 0.09), 0),
+    ],
+)
+def test_a_stand_in_for_an_unknown_law_is_not_selected(monkeypatch, left_at, gaps, kept):
+    monkeypatch.setattr("jaxsid.gap.verdict.verdict_of", lambda *_: Verdict("unknown", {}, ((), ())))
+    monkeypatch.setattr("jaxsid.gap.verdict.located", lambda x: SimpleNamespace(likely=(x,)))
+    here, there = ranking(0.0, kinds=[("backlash", B12)]), ranking(0.0, kinds=[("hysteresis", B23)])
+    found = causes(here, there, closures=[closure(x) for x in gaps])._replace(places=left_at)
+    left, verdict = concluded(examination(), found)
+    assert [x.kind for x in left.selected] == ["backlash", "hysteresis"][:kept]
+    assert len(verdict.likely) == kept
+    # model, closure and what is left are of one hypothesis
+    assert len(left.closures) == len(left.lefts) == max(kept, 1)
+    assert left.chosen is (found.selected[kept - 1].refit if kept else found.recalibrated)
+    assert left.closures[-1] is (found.closures[kept - 1] if kept else found.linear)
+    assert left.lefts[-1] is (found.lefts[kept - 1] if kept else found.before[1])
+
+
+def test_a_verdict_other_than_unknown_leaves_all_causes():
+    found = causes(ranking(0.0, -200.0), closures=[closure(0.012)])
+    assert concluded(examination(), found)[0] is found
+
+
+# offsets and records without noise
+
+
+def test_two_springs_at_one_place_imitate_one_of_another_shape():
+    def said(*found):
+        rounds = [ranking(0.0, -500.0, kinds=[x, ("hysteresis", B23)]) for x in found]
+        return verdict_of(examination(), causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
+
+    both = said(("end_stop", B12), ("cubic_stiffness", {"between": ("b2", "b1")}))
+    assert both.name == "unknown"
+    assert both.probability["unknown"] == IMITATED
+    assert [x.kind for x in both.imitating] == ["end_stop", "cubic_stiffness"]
+    # a polynomial, other places, other laws
+    assert said(("quadratic_stiffness", B12), ("cubic_stiffness", B12)).name == "effect"
+    assert said(("end_stop", B12), ("cubic_stiffness", B23)).name == "effect"
+    assert said(("coulomb_friction", B12), ("cubic_stiffness", B12)).imitating == ()
+
+
+def test_springs_of_the_catalogue_are_curves_over_the_displacement():
+    springs = [k for k in CATALOGUE.values() if k.restoring and not k.states]
+    assert len(springs) >= 5
+    d = jnp.linspace(-0.9, 0.9, 9)
+    at = lambda v, t: Motion(d, *(x + 0 * d for x in (v, 0.0, t, 3.0)))  # noqa: E731
+    for kind in springs:
+        numbers = [jnp.asarray(0.4 + 0.1 * i) for i in range(len(kind.parameters))]
+        force = kind.force(at(0.1, 0.0), *numbers)
+        np.testing.assert_array_equal(force, kind.force(at(-7.0, 5.0), *numbers))
+        assert np.ptp(np.diff(force, n=2)) > 0.01  # and none is straight
