@@ -1,5 +1,6 @@
 """Which candidates of a round are fitted, and what follows where nothing more explains what an effect leaves."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -131,6 +132,41 @@ def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):
     fitted, rough = tried(candidates, evidences, 2, senseless=("stribeck_friction",))
     assert [c.kind for c, _ in rough] == ["coulomb_friction", "backlash", "stribeck_friction"]
     assert ("hysteresis", ("b1", "b3")) not in fitted
+
+
+@pytest.mark.parametrize("diverging", [0, 4])
+def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypatch, diverging):
+    every = [
+        (candidate("cogging_ripple", {"between": (f"x{i}", "y")}), Hypothesis(), None) for i in range(30)
+    ]
+    thorough, compared = [], []
+
+    def whole(bench, hypothesis, start, effort):
+        thorough.append(len(thorough))
+        return Whole(BENCH, refit(-math.inf if len(thorough) <= diverging else -1e5 - len(thorough)))
+
+    patches = {
+        "loudest": lambda bench, without: bench,
+        "_roughly": lambda part, every, tried, say: [
+            (c, refit(-10.0 * i)) for i, (c, *_) in enumerate(every)
+        ],
+        "_whole": whole,
+        "_values": lambda rough, done, *_: [
+            done[i].refit.fit.evidence if i in done else r.fit.evidence for i, (_, r) in enumerate(rough)
+        ],
+        "side_by_side": lambda f, xs: [f(x) for x in xs],
+        "changes_of": lambda found, bench: None,
+        "value": lambda found, bench: found.fit.evidence,
+        "_compared": lambda rough, values, *_: compared.append(values) or ranking(0.0),
+    }
+    for name, instead in patches.items():
+        monkeypatch.setattr(explain, name, instead)
+    explain._round(BENCH, every, refit(0.0), explain.FURTHER, silent)
+    (values,) = compared
+    # what diverges at once costs nothing, and does not count
+    assert len(thorough) == explain.FURTHER.refined + explain.MORE + diverging
+    assert int(np.argmax(values)) == diverging
+    assert values[-1] < values[diverging]
 
 
 def test_a_round_without_candidates_has_no_fits(tried):

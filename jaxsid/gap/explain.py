@@ -59,6 +59,7 @@ PLAINER = 2  # laws of fewer numbers that are tried where the best one acts and 
 HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
+MORE = 3  # further ones that are fitted thoroughly as those before them turn out worse than they seemed
 CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 SPRING = "missing_connection"
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
@@ -314,11 +315,16 @@ def _round(
         return _whole(bench, r.hypothesis, {"changes": changes}, effort)
 
     close = [(top - value(r, bench)) / scale / effort.temperature < CLOSE for _, r in rough]
-    best = range(min(effort.refined + len(done), len(rough)))
+    most = effort.refined + len(done)
+    best = range(min(most, len(rough)))
     due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]
     done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     near = CLOSE * scale * effort.temperature
     while due := _due(rough, values := _values(rough, done, bench, part), done, near):
+        top = max((values[i] for i in done), default=-math.inf)
+        if sum(math.isfinite(values[i]) for i in done) >= most + MORE:
+            values = [x if i in done else min(x, top - near) for i, x in enumerate(values)]
+            break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     return _compared(rough, values, done, bench, without, effort)
 
@@ -386,10 +392,12 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
     """
     search, linked = {"steps": effort.steps, "gain": FINE}, {"steps": LINKED, "gain": FINE}
     found = refitted(bench, hypothesis, **start, **search)
+    if not math.isfinite(found.fit.evidence):
+        return Whole(bench, found)
     bench, found = tied(bench, found, **linked)
     if (finer := resolved(bench, found)) is not bench:
         bench, found = finer, refitted(finer, found.hypothesis, **_from(found, finer), **search)
-    if any(n.degrees <= 0 for n in bench.noises) and math.isfinite(found.fit.evidence):
+    if any(n.degrees <= 0 for n in bench.noises):
         bench = weighed_anew(bench, found)
         found = refitted(bench, found.hypothesis, **_from(found, bench), **search)
         bench, found = tied(bench, found, **linked)
