@@ -13,11 +13,13 @@ from jaxsid.gap.closure import (
     _run_on,
     closure_of,
     fraction,
+    left_before,
     left_of,
 )
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
 from jaxsid.gap.refit import Hypothesis, refitted, shot_of
+from jaxsid.gap.windows import blocks_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
 
@@ -171,6 +173,22 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     np.testing.assert_array_equal(measured[:, :2], y[-SAMPLES:, :2])
     rms = np.sqrt((left[:, :2] ** 2).mean(axis=0)) / noise.rms()[:2]
     np.testing.assert_allclose(rms, 1, atol=0.1)
+
+
+def test_what_is_left_before_is_noise_sample_by_sample():
+    y, level = colored(exact(drive()), 0)
+    absent = np.append(level[:2], np.nan)
+    data = record(drive(), y[:, :2], kinds=((0, ""), (1, "")))
+    cut = bench(y, level)
+    blocks = blocks_of(chain(), [data], [known(absent)], cut.blocks[0].y.shape[1] - cut.blocks[0].lead)
+    cut = cut._replace(blocks=blocks, states=tuple(np.zeros((len(b.y), 6)) for b in blocks))
+    (left,) = left_before(refitted(cut, Hypothesis()), cut)
+    assert np.isfinite(left[:SAMPLES, :2]).all()
+    assert np.isnan(left[SAMPLES:]).all()
+    assert np.isnan(left[:, 2]).all()
+    # modelled less measured; the states of windows take up a part of the noise
+    noise = (y - exact(drive()))[:, :2]
+    assert ((left[:SAMPLES, :2] + noise).std(axis=0) < 0.4 * noise.std(axis=0)).all()
 
 
 @pytest.mark.parametrize("few", [3, 60])

@@ -79,3 +79,16 @@ def test_a_stop_that_is_met_in_the_last_quarter_only_is_found():
     (left,) = found.causes.lefts[-1].left
     assert FEWEST <= len(left) < SAMPLES - END
     assert found.closure.fraction > 0.95
+
+
+@pytest.mark.slow
+def test_a_stop_met_in_the_last_quarter_only_is_found_beside_a_gain_that_explains_all_before_it():
+    u = drive()
+    u[END:] *= 5.0
+    y = with_effect(u, "end_stop", (0, 1), {"stiffness": 3000.0, "clearance": 0.035})
+    y[:, 2] *= 1.3
+    found = diagnose(chain(), record(u, noisy(y)))
+    assert found.verdict == "effect"
+    assert {x["kind"] for x in found.selected()} == {"sensor_gain", "end_stop"}
+    assert len(found.causes.lefts[-1].left[0]) < SAMPLES - END
+    assert found.closure.fraction > 0.95

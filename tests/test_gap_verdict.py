@@ -41,7 +41,7 @@ def causes(*rounds, closures):
     ends = nothing, Left((np.ones((1, 1)),), ())
     best = refit(0.0)
     return Causes(
-        rounds, last, tuple(chosen), last, best, tuple(closures), lefts, linear, (), None, None, ends
+        rounds, last, tuple(chosen), last, best, tuple(closures), lefts, linear, (), None, None, ends, ()
     )
 
 

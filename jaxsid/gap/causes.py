@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsid.gap.closure import Closure, Left, closure_of, left_of
+from jaxsid.gap.closure import Closure, Left, closure_of, left_before, left_of, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
     ERRORS,
@@ -24,6 +24,7 @@ from jaxsid.gap.explain import (
     rank,
     rank_again,
 )
+from jaxsid.gap.held_out import later_ends
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.locate import Scored
 from jaxsid.gap.look import Look, candidates_of, looked, varied
@@ -73,6 +74,8 @@ class Causes(NamedTuple):
         lefts: what each of these leaves of these samples.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
+        later: how many samples of each record must be seen for all that it holds; as many as were where the selected
+            effects leave no more of the others.
         noises: of each record; where it is guessed, what the chosen model leaves if tests find nothing in it, else no
             more than that.
         remaining: tests of what is left of the other samples.
@@ -91,6 +94,7 @@ class Causes(NamedTuple):
     remaining: Null
     places: Scored | None
     before: tuple[Left, Left]
+    later: tuple[int, ...]
 
     @property
     def most(self) -> str:
@@ -155,7 +159,7 @@ def causes_of(
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
     say("how far the gap shrinks")
-    ends = [len(r.y) for r in seen]
+    ends = tuple(len(r.y) for r in seen)
     lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=is_free_or_unstable(model))
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     before = lefts(refitted(frozen, Hypothesis())), lefts(linear)
@@ -178,6 +182,9 @@ def causes_of(
         look.null,
         None if look.clear else look.scored,
         before,
+        _later(chosen, bench, whole, ends)
+        if selected and substantial(each[-1].after, each[-1].noise_floor)
+        else ends,
     )
 
 
@@ -196,6 +203,12 @@ def linear_left(
     every = Hypothesis(wrong=tuple(range(len(bench.tolerance))))
     linear = refitted(bench, every, changes=_found_changes(found))
     return left_of(linear, bench, whole, ends, windowed=is_free_or_unstable(model))
+
+
+def _later(chosen: Refit, bench: Bench, whole: Sequence[Record], ends: tuple[int, ...]) -> tuple[int, ...]:
+    """Ends beyond which no window holds far more than those before them; see `later_ends`."""
+    after = left_of(chosen, bench, whole, ends, windowed=True)
+    return later_ends(whole, ends, left_before(chosen, bench), after.left)
 
 
 def _found_changes(found: Examination) -> Float[np.ndarray, " e"]:

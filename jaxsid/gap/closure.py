@@ -118,6 +118,20 @@ def left_of(
     return Left(tuple(left), tuple(measured))
 
 
+def left_before(found: Refit, bench: Bench) -> tuple[Float[np.ndarray, "..."], ...]:
+    """(samples, outputs) of every record, what a model leaves in the windows that it was fitted to.
+
+    Args:
+        found: model.
+        bench: that it was fitted to.
+    """
+    parts: list[list[np.ndarray]] = [[] for _ in range(bench.records)]
+    for b, x in zip(bench.blocks, _left(found, bench, bench.blocks, found.fit.states), strict=True):
+        there = _judged(b, b.weight) > 0
+        parts[int(b.record[0])].append(np.where(there, _judged(b, x), np.nan))
+    return tuple(np.concatenate(own) for own in parts)
+
+
 def _length(bench: Bench) -> int:
     return bench.blocks[0].y.shape[1] - bench.blocks[0].lead
 

@@ -268,7 +268,7 @@ def diagnose(
     ends = tuple(map(usual_end, records))
     seen = tuple(map(seen_part, records, ends))
     found, causes, verdict = _judged(model, seen, records, progress)
-    if verdict.name in ("none", "unknown") and (later := _later(model, seen, records, found, causes)) != ends:
+    if (later := _later(model, seen, records, found, causes)) != ends:
         if progress is not None:
             progress("the last samples hold far more than all before: again with most of those")
         seen = tuple(map(seen_part, records, later))
@@ -301,6 +301,8 @@ def _later(
     causes: Causes | None,
 ) -> tuple[int, ...]:
     """How many samples of each record must be seen to know what is there."""
+    if causes is not None and causes.selected:
+        return causes.later
     before = [x.refit - x.measured for x in found.beside]
     after = linear_left(model, seen, whole, found) if causes is None else causes.before[1]
     return later_ends(whole, [len(r.y) for r in seen], before, after.left)
