@@ -136,26 +136,11 @@ def causes_of(
         progress: called with a line of text as each stage begins.
     """
     say = progress or (lambda text: None)
-    say("kinds of effects")
-    start = _Found(
-        bench_of(model, seen, found.noises, found.fit),
-        Look(found.fit, found.null, found.scored),
-        (),
-        (),
-        None,
-    )
-    if found.finding == "structure":
-        at = _effects(start, model, seen, say)
-    else:
-        within = refitted(start.bench, Hypothesis(), changes=_found_changes(found))
-        at = start._replace(before=within, look=start.look._replace(scored=None))
-    at = _numbers(at, model, seen, say)
+    at = _searched(model, seen, found, say)
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before
-    linear = refitted(
-        bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=changes_of(chosen, bench)
-    )
+    linear = _freely(bench, changes_of(chosen, bench))
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
     say("how far the gap shrinks")
@@ -182,10 +167,33 @@ def causes_of(
         look.null,
         None if look.clear else look.scored,
         before,
-        _later(chosen, bench, whole, ends)
-        if selected and substantial(each[-1].after, each[-1].noise_floor)
-        else ends,
+        _later(chosen, bench, whole, ends, each[-1]) if selected else ends,
     )
+
+
+def _searched(
+    model: LumpedModel, seen: Sequence[Record], found: Examination, say: Callable[[str], None]
+) -> "_Found":
+    """All that is found: effects where the structure is in doubt, then numbers of the model."""
+    say("kinds of effects")
+    start = _Found(
+        bench_of(model, seen, found.noises, found.fit),
+        Look(found.fit, found.null, found.scored),
+        (),
+        (),
+        None,
+    )
+    if found.finding == "structure":
+        at = _effects(start, model, seen, say)
+    else:
+        within = refitted(start.bench, Hypothesis(), changes=_found_changes(found))
+        at = start._replace(before=within, look=start.look._replace(scored=None))
+    return _numbers(at, model, seen, say)
+
+
+def _freely(bench: Bench, changes: Float[np.ndarray, " e"]) -> Refit:
+    """The best linear model: all of its numbers may be far off."""
+    return refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=changes)
 
 
 def linear_left(
@@ -200,13 +208,16 @@ def linear_left(
         found: examination of the former.
     """
     bench, ends = bench_of(model, seen, found.noises, found.fit), [len(r.y) for r in seen]
-    every = Hypothesis(wrong=tuple(range(len(bench.tolerance))))
-    linear = refitted(bench, every, changes=_found_changes(found))
+    linear = _freely(bench, _found_changes(found))
     return left_of(linear, bench, whole, ends, windowed=is_free_or_unstable(model))
 
 
-def _later(chosen: Refit, bench: Bench, whole: Sequence[Record], ends: tuple[int, ...]) -> tuple[int, ...]:
-    """Ends beyond which no window holds far more than those before them; see `later_ends`."""
+def _later(
+    chosen: Refit, bench: Bench, whole: Sequence[Record], ends: tuple[int, ...], closure: Closure
+) -> tuple[int, ...]:
+    """Ends beyond which no window holds far more than those before them, see `later_ends`, where there is more."""
+    if not substantial(closure.after, closure.noise_floor):
+        return ends
     after = left_of(chosen, bench, whole, ends, windowed=True)
     return later_ends(whole, ends, left_before(chosen, bench), after.left)
 
