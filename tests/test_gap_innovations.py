@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from gap_bench import known
-from gap_helpers import chain, record
+from gap_helpers import chain, drive, exact, record
 from scipy import signal, stats
 
 from jaxsid.gap.innovations import LAGS, PARTS, coherence, unsteadiness
-from jaxsid.gap.null import _leveled, _own, null_test
+from jaxsid.gap.null import _leveled, _own, left_shares, null_test
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given
 
@@ -25,7 +25,7 @@ def left(y):
 def asked(y):
     fit = left(y)
     leveled = tuple(_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True))
-    return {t.name: t for t in _own(fit, leveled)}
+    return {t.name: t for t in _own(fit, leveled)[1]}
 
 
 def white(seed, samples=SAMPLES):
@@ -70,8 +70,25 @@ def test_a_force_that_several_sensors_feel_is_common_to_them():
 
 
 def test_a_sensor_alone_has_nothing_in_common():
-    assert coherence([white(0)[:, :1]]) == (1.0, 0.0)
-    assert unsteadiness([white(0)[:, :0]]) == (1.0, 0.0)
+    assert coherence([white(0)[:, :1]]) == (1.0, 0.0, ())
+    assert unsteadiness([np.zeros((SAMPLES, 1))]) == (1.0, 0.0, ())
+
+
+def test_shares_are_those_of_the_sensor_that_has_it():
+    """A quiet sensor that does what no noise does counts as little as what it has left, however loud another is."""
+    u, rng = drive(SAMPLES), np.random.default_rng(3)
+    y = exact(u)
+    e = y.std(axis=0) * rng.standard_normal(y.shape) * [0.05, 0.05, 1e-4]
+    e[300:350, 2] *= 4
+    noise = known(e.std(axis=0))
+    noise.taps[:, 1:] = 0.0
+    fit = as_given(chain(), [record(u, y + e)], [noise])
+    assert left_shares(fit) == pytest.approx([0.05, 0.05, 1.4e-4], rel=0.1)
+    leveled = tuple(_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True))
+    found = {t.name: t for t in _own(fit, leveled)[1]}
+    assert found["change with time"].p_value < 1e-5
+    assert found["change with time"].share < 2e-4
+    assert found["common to sensors"].p_value > 1e-3
 
 
 def test_what_acts_at_times_changes_with_time():

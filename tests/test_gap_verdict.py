@@ -73,7 +73,7 @@ def test_what_is_far_above_the_noise_is_never_none(monkeypatch):
     for rms in (0.99 * LOUD, 1.01 * LOUD):
         left = fit._replace(squares=rms**2 * fit.equations)
         found = examination()._replace(
-            finding="structure", fit=left, null=null.Null(1e-9, 0.1 * 0.9 * SLIGHT, ())
+            finding="structure", fit=left, null=null.Null(1e-9, 0.1 * 0.9 * SLIGHT, (), ())
         )
         verdict[rms > LOUD] = verdict_of(found, tried).name
     assert verdict == {False: "none", True: "unknown"}

@@ -18,7 +18,7 @@ from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
-from jaxsid.gap.words import about_numbers, next_experiment, remaining, summary
+from jaxsid.gap.words import about_inputs, about_numbers, next_experiment, remaining, summary
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
@@ -350,7 +350,7 @@ def _warnings(
     ]
     if verdict.name != "none" and (causes is None or not causes.selected):
         said += about_numbers(found)
-    said += _about_sensors(model, found)
+    said += _about_sensors(model, found) + about_inputs(model, found)
     if any(n.source == SOURCES[-1] for n in found.noises):
         said.append(
             "Nothing tells of the noise apart: its level is that of the quietest band, or of what the best linear "

@@ -2,7 +2,7 @@
 
 The shapes that an effect's force may have are evaluated on the refitted model's own motion, not on the measured one, so
 that noise does not find itself. Whatever the level of the noise, and any colour that is the same throughout, an F test
-says whether they explain more of what is left than chance does.
+says whether they explain more of what is left than chance does. Noise of measured inputs is noise too.
 """
 
 from collections.abc import Sequence
@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
+from jaxtyping import Float
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
 from jaxsid.gap.innovations import coherence, innovations, unsteadiness
+from jaxsid.gap.input_noise import LARGEST, InputNoise, input_noise, refitted, whitening
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
 from jaxsid.gap.recalibrate import Linear, Recalibrated
@@ -30,6 +32,10 @@ DOUBT = 0.05  # likewise, from which on nothing speaks for it either
 COMMON, CHANGE = "common to sensors", "change with time"
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
+CARRIED = (
+    0.1  # of what noise of inputs leaves: what tests may take for a law, as the motion has that noise too
+)
+HEARD = 30.0  # power of an input next to that of its noise from which on a line tells of laws
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
 
@@ -54,11 +60,13 @@ class Null(NamedTuple):
         p_value: of all tests together, by Holm's rule.
         share: rms of the most that any test found for certain, next to that of the response.
         tests: each alone.
+        input_noise: of each measured input, rms next to its own, where that is what sensors have in common; else 0.
     """
 
     p_value: float
     share: float
     tests: tuple[Test, ...]
+    input_noise: tuple[float, ...]
 
     @property
     def own(self) -> bool:
@@ -79,13 +87,22 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
     Source: S. Holm, Scand. J. Statistics 6 (1979).
     """
     leveled = tuple(_leveled(s, x) for s, x in zip(fit.settings, fit.linear, strict=True))
-    tests = [*_laws(fit, leveled, tuple(places)), _lone_line(fit), *_steady(fit, leveled)]
-    tests += [] if deflated else _own(fit, leveled)
+    noise, own = _own(fit, leveled)
+    carried = CARRIED * max((_mean(left_shares(fit) * x.share) for x in noise), default=0.0)
+    sought = [*_laws(fit, leveled, tuple(places), noise), *_steady(fit, leveled)]
+    tests = [x._replace(share=float(np.sqrt(max(x.share**2 - carried**2, 0.0)))) for x in sought]
+    tests.append(_lone_line(fit))
+    tests += [] if deflated else own
     if all(n.degrees > 0 for n in fit.noises):
         tests.append(_power(fit))
     worst = min(tests, key=lambda t: t.p_value)
     share = max(t.share for t in tests if t is worst or t.p_value * len(tests) < SIGNIFICANT)
-    return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests))
+    each = (
+        tuple(np.max([x.relative for x in noise], axis=0).tolist())
+        if noise
+        else (0.0,) * len(fit.model.inputs)
+    )
+    return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests), each)
 
 
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
@@ -102,26 +119,58 @@ def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
     return float(gammaincc(len(within.change) / 2, ratio / 2))
 
 
-def _laws(fit: Recalibrated, settings: tuple[Setting, ...], places: tuple[Place, ...]) -> list[Test]:
-    """An F test for the shapes of each place."""
-    ports, count = ports_of(fit.model, places), len(places)
-    spread = lambda m: jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), m)  # noqa: E731
-    motions: list[Motion] = [spread(x.motion) for x in fit.linear]
-    sizes = [extents(s, ports, m) for s, m in zip(fit.settings, motions, strict=True)]
-    size = together(sizes)
-    none = Force(jnp.zeros((count, 1)), jnp.ones((count, 1)))
-    parts = [tables(s, ports, Guess(m, size), none) for s, m in zip(settings, motions, strict=True)]
-    gram = np.sum([np.asarray(x.gram)[:, 0] for x in parts], axis=0)
-    elements = len(fit.change)
-    nuisances = elements + sum(len(s.transient) for s in fit.settings)
+def _laws(
+    fit: Recalibrated, settings: tuple[Setting, ...], places: tuple[Place, ...], noise: tuple[InputNoise, ...]
+) -> list[Test]:
+    """An F test for the shapes of each place; of sensors and inputs, which filters may be, on lines with an input."""
+    heard = [_heard(s, of) for s, of in zip(settings, noise or [None] * len(settings), strict=True)]
+    loud = tuple(
+        eqx.tree_at(lambda s: s.scale, s, s.scale * h[:, None]) for s, h in zip(settings, heard, strict=True)
+    )
+    gram, told = _grams(fit, settings, places, noise), float(np.mean(np.concatenate(heard)))
+    again = _grams(fit, loud, places, noise) if told < 1 else gram
+    every = fit, fit._replace(equations=int(fit.equations * told))
     return [
-        _shapes_test(f"law at {p.label}", g, elements, nuisances, fit)
-        for p, g in zip(places, gram, strict=True)
+        _shapes_test(f"law at {p.label}", *((g, every[0]) if p.where == "between" else (a, every[1])))
+        for p, g, a in zip(places, gram, again, strict=True)
     ]
 
 
-def _shapes_test(name: str, gram: np.ndarray, elements: int, nuisances: int, fit: Recalibrated) -> Test:
+def _heard(setting: Setting, noise: InputNoise | None) -> Float[np.ndarray, " lines"]:
+    """1 where some input is above its noise, else 0: what noise in a record alone would do, bodies never did.
+
+    One sensor has nothing in common with another that would tell of such noise: it may be as loud as any.
+    """
+    u = jnp.asarray(setting.spectra.u)
+    level = np.asarray(line_level(u, jnp.ones(u.shape))) ** 2
+    if noise is not None:
+        return np.asarray((level > HEARD * noise.power).any(axis=1) * 1.0)
+    alone = np.asarray(setting.spectra.present).sum() == 1
+    least = LARGEST**2 * np.asarray(jnp.abs(u) ** 2).mean(axis=0)
+    return np.asarray((level > least).any(axis=1) * 1.0) if alone else np.ones(len(level))
+
+
+def _grams(
+    fit: Recalibrated, settings: tuple[Setting, ...], places: tuple[Place, ...], noise: tuple[InputNoise, ...]
+) -> np.ndarray:
+    """Products of elements, shapes and what is left, (places, k, k), of all records."""
+    ports, count = ports_of(fit.model, places), len(places)
+    spread = lambda m: jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), m)  # noqa: E731
+    motions: list[Motion] = [spread(x.motion) for x in fit.linear]
+    size = together([extents(s, ports, m) for s, m in zip(fit.settings, motions, strict=True)])
+    none = Force(jnp.zeros((count, 1)), jnp.ones((count, 1)))
+    white = [jnp.asarray(whitening(*x)) for x in zip(settings, noise, strict=True)] if noise else None
+    parts = [
+        tables(s, ports, Guess(m, size), none, None if white is None else white[i])
+        for i, (s, m) in enumerate(zip(settings, motions, strict=True))
+    ]
+    return np.asarray(np.sum([np.asarray(x.gram)[:, 0] for x in parts], axis=0))
+
+
+def _shapes_test(name: str, gram: np.ndarray, fit: Recalibrated) -> Test:
     """Of one place, elements out of the way first."""
+    elements = len(fit.change)
+    nuisances = elements + sum(len(s.transient) for s in fit.settings)
     norm = np.sqrt(np.diag(gram))
     gram = gram / np.where(norm > 0, norm, 1.0) / np.where(norm > 0, norm, 1.0)[:, None]
     e = elements
@@ -151,12 +200,24 @@ def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
     ]
 
 
-def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
-    """Whether what is left is each sensor's own, where there are several, and the same throughout."""
+def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> tuple[tuple[InputNoise, ...], list[Test]]:
+    """Noise of the inputs, where sensors have it in common; whether the rest is each sensor's own, and steady."""
     white = [innovations(s, x) for s, x in zip(settings, fit.linear, strict=True)]
-    found = [(COMMON, coherence(white))] if any(e.shape[1] > 1 for e in white) else []
-    found.append((CHANGE, unsteadiness(white)))
-    return [Test(name, p, float(np.sqrt(part)) * left_share(fit)) for name, (p, part) in found]
+    noise: tuple[InputNoise, ...] = ()
+    common = coherence(white)
+    if common.p_value < DOUBT:
+        noise = tuple(input_noise(s, x) for s, x in zip(settings, fit.linear, strict=True))
+        noise = noise if any(x.power.any() for x in noise) and all(x.plausible for x in noise) else ()
+    if noise:
+        linear = refitted(settings, fit.linear, noise)
+        noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
+        white = [innovations(*x) for x in zip(settings, linear, noise, strict=True)]
+        common = coherence(white)
+    left, found = left_shares(fit), {CHANGE: unsteadiness(white)}
+    if any(e.any(axis=0).sum() > 1 for e in white):
+        found[COMMON] = common
+    share = lambda x: float(np.sqrt(x.part) * np.prod(left[list(x.sensors)]) ** (1 / max(len(x.sensors), 1)))  # noqa: E731
+    return noise, [Test(name, x.p_value, share(x)) for name, x in found.items()]
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:
@@ -172,10 +233,28 @@ def left_share(fit: Recalibrated) -> float:
     Args:
         fit: the model and what it leaves.
     """
-    left = sum((np.abs(np.asarray(x.left)) ** 2).sum(axis=0) for x in fit.linear)
-    size = sum((np.abs(np.asarray(s.spectra.y)) ** 2).sum(axis=0) for s in fit.settings)
-    present = np.asarray(size) > 0
-    return float(np.sqrt((np.asarray(left)[present] / np.asarray(size)[present]).mean()))
+    return _mean(left_shares(fit))
+
+
+def left_shares(fit: Recalibrated) -> Float[np.ndarray, " outputs"]:
+    """Likewise of each sensor; NaN for those that no record has.
+
+    Args:
+        fit: the model and what it leaves.
+    """
+    # a line on a pole of the model, as that of zero where bodies are free, tells nothing of what it misses
+    each = [np.asarray(s.spectra.weight) for s in fit.settings]
+    left = np.sum(
+        [w @ np.abs(np.asarray(x.left)) ** 2 for w, x in zip(each, fit.linear, strict=True)], axis=0
+    )
+    size = np.sum(
+        [w @ np.abs(np.asarray(s.spectra.y)) ** 2 for w, s in zip(each, fit.settings, strict=True)], axis=0
+    )
+    return np.sqrt(np.divide(left, size, out=np.full(len(size), np.nan), where=size > 0))
+
+
+def _mean(shares: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(shares**2)))
 
 
 def _lone_line(fit: Recalibrated) -> Test:

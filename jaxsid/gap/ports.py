@@ -137,7 +137,13 @@ def _read_before(spectra: Spectra, port: Ports, size: Extent) -> Complex[Array, 
 
 
 @compiled
-def tables(given: Setting, ports: Ports, guess: Guess, force: Force) -> Table:
+def tables(
+    given: Setting,
+    ports: Ports,
+    guess: Guess,
+    force: Force,
+    whitening: Complex[Array, "lines outputs outputs"] | None = None,
+) -> Table:
     """Tables (places, h, ...) of a record.
 
     Args:
@@ -145,16 +151,19 @@ def tables(given: Setting, ports: Ports, guess: Guess, force: Force) -> Table:
         ports: places.
         guess: their motion and extents.
         force: processes (places, h).
+        whitening: what makes noise that sensors have in common white, in place of the setting's scale.
     """
     spectra = given.spectra
     left = (spectra.y - spectra.response)[:, :, None]
+    seen = given.scale if whitening is None else (given.scale > 0) * 1.0
+    mixed = (lambda x: x) if whitening is None else lambda x: jnp.einsum("lpq,lq...->lp...", whitening, x)
 
     def one(row: tuple[Ports, Guess, Force]) -> Table:
         port, guess, force = row
         columns = jnp.concatenate([columns_of(given, port, guess.motion, guess.size), left], axis=2)
         plain, _ = transfers_of(spectra, port)
         densities = density(force, spectra.omega, spectra.dt)
-        return table(columns, spectra.free, plain, given.scale, densities, given.transient)
+        return table(mixed(columns), mixed(spectra.free), mixed(plain), seen, densities, given.transient)
 
     return lax.map(one, (ports, guess, force))
 

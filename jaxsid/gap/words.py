@@ -145,6 +145,21 @@ def about_numbers(found: Examination) -> list[str]:
     return said
 
 
+def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
+    """Inputs whose own noise is what sensors have in common.
+
+    Args:
+        model: names them.
+        found: the examination.
+    """
+    return [
+        f"What is left of all sensors is in common what noise of the measured '{x.name}', {percent(part)} of its rms, "
+        "would leave. That counts as noise."
+        for x, part in zip(model.inputs, found.null.input_noise, strict=True)
+        if part > 0
+    ]
+
+
 def _place(place: Place) -> str:
     return " - ".join(place.ends) if place.where == "between" else f"{place.where} {place.ends[0]}"
 

@@ -1,0 +1,170 @@
+"""Noise of measured inputs: what a model makes of it is in what it leaves, and common to all sensors.
+
+A recorded input u + n drives the model with n too, so that it leaves r = e - H n, with e each sensor's own. Where that
+is all, lines of r have the covariance R = H s H' + diag(own), with s the powers of n. Powers are found by the largest
+likelihood: those of what is expected of n and of e, given r, are what to expect them from, again and again.
+
+Sources: R. Pintelon and J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., ch. 8; D. B. Rubin
+and D. T. Thayer, EM algorithms for ML factor analysis, Psychometrika 47 (1982).
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.optimize import nnls
+
+from jaxsid.gap.recalibrate import Linear
+from jaxsid.gap.setting import Setting
+from jaxsid.gap.spectra import parameter_columns, stacked
+from jaxsid.impulse.lines import line_level
+
+ROUNDS = 30  # of expecting and finding
+PARTS = 8  # of the lines, each with a power of its own where they tell it
+LEAST = 1e-4  # part of a sensor's power that is its own at least
+DEPENDENT = 1e-9  # size of combinations of columns, next to the largest, that are nothing
+LARGEST = 0.02  # rms next to the input's beyond which it is no noise of a sensor but something that acts
+
+
+class InputNoise(NamedTuple):
+    """Noise of one record's inputs, beside that of each sensor, in units of what is left at each line.
+
+    Attributes:
+        power: (lines, inputs) variance of the inputs' lines.
+        own: (lines, outputs) of each sensor's own noise, next to all that is left.
+        relative: (inputs,) rms next to that of the input; infinite for noise of an input that is zero.
+        share: (outputs,) rms of what the model makes of it, next to that of what it leaves.
+    """
+
+    power: Float[np.ndarray, "lines inputs"]
+    own: Float[np.ndarray, "lines outputs"]
+    relative: Float[np.ndarray, " inputs"]
+    share: Float[np.ndarray, " outputs"]
+
+    @property
+    def plausible(self) -> bool:
+        """Whether it is no more than what sensors of inputs may have."""
+        return bool((self.relative <= LARGEST).all())
+
+
+def input_noise(setting: Setting, linear: Linear) -> InputNoise:
+    """The noise of inputs, and each sensor's own, that best give what is left.
+
+    Args:
+        setting: its scale is one over the level of what is left at each line.
+        linear: the model beside the record.
+    """
+    scale = np.asarray(setting.scale)
+    left, driven = np.asarray(linear.left) * scale, np.asarray(setting.spectra.driven) * scale[:, :, None]
+    parts = np.array_split(np.arange(len(left)), PARTS)
+    power = np.broadcast_to(_white(left, driven), (len(left), driven.shape[2])).copy()
+    own = np.maximum(1 - _around(_made(driven, power)), LEAST)
+    for _ in range(ROUNDS):
+        gain = (driven * power[:, None, :]).conj().transpose(0, 2, 1) @ np.linalg.inv(
+            _covariance(driven, power, own)
+        )
+        expected = np.einsum("lip,lp->li", gain, left)
+        spread = np.eye(driven.shape[2]) * power[:, None, :] - gain @ driven * power[:, None, :]
+        found = np.abs(expected) ** 2 + np.einsum("lii->li", spread).real
+        rest = np.abs(left - np.einsum("lpi,li->lp", driven, expected)) ** 2
+        rest = rest + np.einsum("lpi,lij,lpj->lp", driven, spread, driven.conj()).real
+        own = np.maximum(_around(rest), LEAST)
+        for part in parts:
+            power[part] = found[part].mean(axis=0)
+    return InputNoise(power, own, _relative(setting, power), _share(setting, left, _made(driven, power)))
+
+
+def whitening(setting: Setting, noise: InputNoise) -> Complex[np.ndarray, "lines outputs outputs"]:
+    """Root of the inverse of the covariance of what is left: what it makes of that is white and of each sensor alone.
+
+    Args:
+        setting: as of `input_noise`.
+        noise: of the inputs, and each sensor's own.
+    """
+    scale = np.asarray(setting.scale)
+    driven = np.asarray(setting.spectra.driven) * scale[:, :, None]
+    values, vectors = np.linalg.eigh(_covariance(driven, noise.power, noise.own))
+    return np.asarray(
+        np.einsum("lpk,lqk->lpq", vectors / np.sqrt(values)[:, None, :], vectors.conj() * scale[:, :, None])
+    )
+
+
+def refitted(
+    settings: Sequence[Setting], linear: Sequence[Linear], noises: Sequence[InputNoise]
+) -> tuple[Linear, ...]:
+    """Elements and states at the start fitted anew, as noise of the inputs asks for: what that leaves.
+
+    Fitted as if noise were each sensor's own they are off by far more than sensors may be that are quieter than the
+    inputs' noise.
+
+    Args:
+        settings: of each record, as of `input_noise`.
+        linear: the model beside them.
+        noises: of the inputs.
+    """
+    parts = [_columns(*x) for x in zip(settings, linear, noises, strict=True)]
+    reduced = []
+    for slopes, free, left in parts:
+        state = np.linalg.lstsq(free, np.column_stack([slopes, left]), rcond=DEPENDENT)[0]
+        reduced.append(np.column_stack([slopes, left]) - free @ state)
+    every = np.concatenate(reduced)
+    change = np.linalg.lstsq(every[:, :-1], every[:, -1], rcond=DEPENDENT)[0]
+    found = []
+    for setting, x, (slopes, free, left) in zip(settings, linear, parts, strict=True):
+        state = np.linalg.lstsq(free, left - slopes @ change, rcond=DEPENDENT)[0]
+        moved = parameter_columns(setting.spectra, x.motion, setting.directions) @ change
+        moved += setting.spectra.free @ (setting.transient * state)
+        found.append(eqx.tree_at(lambda x: x.left, x, x.left - moved))
+    return tuple(found)
+
+
+def _columns(setting: Setting, linear: Linear, noise: InputNoise) -> list[np.ndarray]:
+    """What changes of elements and of the state do, and what is left, in rows of white noise."""
+    white = jnp.asarray(whitening(setting, noise))
+    slopes = parameter_columns(setting.spectra, linear.motion, setting.directions)
+    free = setting.spectra.free * setting.transient
+    rows = [np.asarray(stacked(white @ x)) for x in (slopes, free, linear.left[:, :, None])]
+    return [*rows[:2], rows[2][:, 0]]
+
+
+def _white(left: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    """Powers (inputs,) of white noise that best give products of two sensors, which their own noise does not enter."""
+    a, b = np.array(list(combinations(range(left.shape[1]), 2))).T
+    columns = (driven[:, a] * driven[:, b].conj()).reshape(-1, driven.shape[2])
+    common = (left[:, a] * left[:, b].conj()).ravel()
+    rows = np.concatenate([columns.real, columns.imag])
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return np.asarray(nnls(rows / size, np.concatenate([common.real, common.imag]))[0] / size)
+
+
+def _made(driven: np.ndarray, power: np.ndarray) -> np.ndarray:
+    """Power of each sensor that noise of the inputs gives, (lines, outputs)."""
+    return np.asarray(np.einsum("lpi,li->lp", np.abs(driven) ** 2, power))
+
+
+def _covariance(driven: np.ndarray, power: np.ndarray, own: np.ndarray) -> np.ndarray:
+    columns = driven * np.sqrt(power)[:, None, :]
+    return np.einsum("lpi,lqi->lpq", columns, columns.conj()) + own[:, :, None] * np.eye(own.shape[1])
+
+
+def _around(power: np.ndarray) -> np.ndarray:
+    """Mean of powers over neighbouring lines."""
+    return np.asarray(line_level(jnp.sqrt(power) + 0j, jnp.ones(power.shape))) ** 2
+
+
+def _relative(setting: Setting, power: np.ndarray) -> np.ndarray:
+    size = np.sqrt((np.abs(np.asarray(setting.spectra.u)) ** 2).mean(axis=0))
+    some = np.where(power.any(axis=0), np.inf, 0.0)
+    return np.divide(np.sqrt(power.mean(axis=0)), size, out=some, where=size > 0)
+
+
+def _share(setting: Setting, left: np.ndarray, made: np.ndarray) -> np.ndarray:
+    scale = np.asarray(setting.scale)
+    level = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+    part, whole = (level**2 * made).sum(axis=0), (level**2 * np.abs(left) ** 2).sum(axis=0)
+    return np.sqrt(np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0))
