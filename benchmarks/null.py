@@ -3,7 +3,7 @@
     .venv/bin/python benchmarks/null.py OUT.jsonl [CASES]
 
 simulates random systems by scipy, their numbers drawn from within the tolerance, with white or coloured noise whose
-level nobody tells, and writes a line a case. A second run goes on where the first stopped; it prints a summary.
+level nobody tells, a third of them with noise of the measured input too, and writes a line a case. A second run goes on where the first stopped; it prints a summary.
 """
 
 import json
@@ -166,6 +166,9 @@ def case(number: int) -> Case:
     noise = scipy.signal.lfilter([1], [1, -pole], white, axis=0)[300:] * np.sqrt(1 - pole**2)
     y = y + part * still.std(axis=0) * noise
     names = tuple(s.name for s in sensors)
+    # a third of the inputs are measured, by sensors with noise of their own
+    felt = float(rng.choice([0.0, 0.0, 1.0])) * 10 ** rng.uniform(-3, -2)
+    u = u + felt * u.std() * rng.standard_normal(u.shape)
     record = Record(u, y, dt, inputs=("f",), outputs=names, hold=(hold,), name=f"case {number}")
     drawn = {
         "shape": list(shape),
@@ -175,6 +178,7 @@ def case(number: int) -> Case:
         "moving": bool(start.any()),
         "noise": part,
         "pole": pole,
+        "input_noise": felt,
         "sensors": [s.kind for s in sensors],
     }
     return Case(model, record, drawn)

@@ -133,12 +133,28 @@ def test_a_random_force_elsewhere_is_no_noise_of_the_input():
     assert {t.name: t.p_value for t in found.null.tests}[COMMON] < 1e-9
 
 
-def test_nothing_is_told_of_an_input_with_one_sensor():
-    r = measured(0.01)
-    alone = Record(r.u, np.asarray(r.y)[:, :1], DT, inputs=r.inputs, outputs=("s0",), name="alone")
-    found = examine(chain(), [alone])
+def test_one_sensor_tells_nothing_of_the_input_nor_is_its_noise_taken_for_a_law():
+    found = [examine(chain(), [alone(measured(0.01, seed))]) for seed in (1, 2, 3)]
+    assert [x.finding for x in found] == 3 * ["agreement"]
+    assert all(x.null.input_noise == (0.0,) for x in found)
+
+
+def alone(r):
+    return Record(r.u, np.asarray(r.y)[:, :1], DT, inputs=r.inputs, outputs=("s0",), name="alone")
+
+
+def test_periods_of_a_measured_input_tell_its_noise_with_one_sensor():
+    """What inputs of two periods differ by drives the model: it is in the noise that periods tell of."""
+    u, rng = drive(SAMPLES, 2, periods=4), np.random.default_rng(9)
+    read = u + 0.01 * u.std() * rng.standard_normal(SAMPLES)
+    y = noisy(exact(u), 0.002, 3)[:, 1:2]
+    found = examine(
+        chain(), [Record(read[:, None], y, DT, inputs=("drive",), outputs=("s1",), name="periods")]
+    )
+    assert found.noises[0].source == "periods"
     assert found.finding == "agreement"
-    assert found.null.input_noise == (0.0,)
+    quiet = examine(chain(), [Record(u[:, None], y, DT, inputs=("drive",), outputs=("s1",), name="periods")])
+    assert found.noises[0].rms()[1] > 1.5 * quiet.noises[0].rms()[1]
 
 
 def test_the_rig_agrees_with_its_own_numbers_though_its_torque_is_measured_with_noise():

@@ -24,9 +24,11 @@ from jaxsid.gap.spectra import parameter_columns, stacked
 from jaxsid.impulse.lines import line_level
 
 ROUNDS = 30  # of expecting and finding
+WEIGHED = 4  # rounds of weighing, before that
 PARTS = 8  # of the lines, each with a power of its own where they tell it
 LEAST = 1e-4  # part of a sensor's power that is its own at least
 DEPENDENT = 1e-9  # size of combinations of columns, next to the largest, that are nothing
+SEEN, CERTAIN = 1.5, 3.0  # standard deviations from which on noise of inputs is allowed for, and is told
 LARGEST = 0.02  # rms next to the input's beyond which it is no noise of a sensor but something that acts
 
 
@@ -38,17 +40,19 @@ class InputNoise(NamedTuple):
         own: (lines, outputs) of each sensor's own noise, next to all that is left.
         relative: (inputs,) rms next to that of the input; infinite for noise of an input that is zero.
         share: (outputs,) rms of what the model makes of it, next to that of what it leaves.
+        seen: of the input that sensors tell most of, the power of white noise in its standard deviations.
     """
 
     power: Float[np.ndarray, "lines inputs"]
     own: Float[np.ndarray, "lines outputs"]
     relative: Float[np.ndarray, " inputs"]
     share: Float[np.ndarray, " outputs"]
+    seen: float
 
     @property
     def plausible(self) -> bool:
-        """Whether it is no more than what sensors of inputs may have."""
-        return bool((self.relative <= LARGEST).all())
+        """Whether it may be there, and is no more than what sensors of inputs may have."""
+        return self.seen > SEEN and bool((self.relative <= LARGEST).all())
 
 
 def input_noise(setting: Setting, linear: Linear) -> InputNoise:
@@ -61,8 +65,9 @@ def input_noise(setting: Setting, linear: Linear) -> InputNoise:
     scale = np.asarray(setting.scale)
     left, driven = np.asarray(linear.left) * scale, np.asarray(setting.spectra.driven) * scale[:, :, None]
     parts = np.array_split(np.arange(len(left)), PARTS)
-    power = np.broadcast_to(_white(left, driven), (len(left), driven.shape[2])).copy()
-    own = np.maximum(1 - _around(_made(driven, power)), LEAST)
+    white, seen = _white(left, driven)
+    power = np.broadcast_to(white, (len(left), len(white))).copy()
+    own = np.maximum(1 - _around(made(driven, power)), LEAST)
     for _ in range(ROUNDS):
         gain = (driven * power[:, None, :]).conj().transpose(0, 2, 1) @ np.linalg.inv(
             _covariance(driven, power, own)
@@ -75,7 +80,7 @@ def input_noise(setting: Setting, linear: Linear) -> InputNoise:
         own = np.maximum(_around(rest), LEAST)
         for part in parts:
             power[part] = found[part].mean(axis=0)
-    return InputNoise(power, own, _relative(setting, power), _share(setting, left, _made(driven, power)))
+    return InputNoise(power, own, _relative(setting, power), _share(setting, left, made(driven, power)), seen)
 
 
 def whitening(setting: Setting, noise: InputNoise) -> Complex[np.ndarray, "lines outputs outputs"]:
@@ -131,19 +136,39 @@ def _columns(setting: Setting, linear: Linear, noise: InputNoise) -> list[np.nda
     return [*rows[:2], rows[2][:, 0]]
 
 
-def _white(left: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Powers (inputs,) of white noise that best give products of two sensors, which their own noise does not enter."""
-    a, b = np.array(list(combinations(range(left.shape[1]), 2))).T
-    columns = (driven[:, a] * driven[:, b].conj()).reshape(-1, driven.shape[2])
-    common = (left[:, a] * left[:, b].conj()).ravel()
-    rows = np.concatenate([columns.real, columns.imag])
-    size = np.linalg.norm(rows, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    return np.asarray(nnls(rows / size, np.concatenate([common.real, common.imag]))[0] / size)
+def _white(left: np.ndarray, driven: np.ndarray) -> tuple[np.ndarray, float]:
+    """Powers (inputs,) of white noise that best give products of two sensors, which their own noise does not enter.
+
+    And the largest in its standard deviations. Products are weighed by the powers that those found before give.
+    """
+    pairs, inputs = list(combinations(np.flatnonzero(left.any(axis=0)), 2)), driven.shape[2]
+    found, seen = np.zeros(inputs), 0.0
+    if not pairs:
+        return found, seen
+    a, b = np.array(pairs).T
+    columns, common = driven[:, a] * driven[:, b].conj(), left[:, a] * left[:, b].conj()
+    for _ in range(WEIGHED):
+        of = made(driven, np.broadcast_to(found, (len(left), inputs)))
+        power = np.maximum(1 - _around(of), LEAST) + of
+        weight = 1 / np.sqrt(power[:, a] * power[:, b])
+        flat, target = (columns * weight[:, :, None]).reshape(-1, inputs), (common * weight).ravel()
+        rows = np.concatenate([flat.real, flat.imag])
+        size = np.linalg.norm(rows, axis=0)
+        rows, size = rows / np.where(size > 0, size, 1.0), np.where(size > 0, size, np.inf)
+        scaled = nnls(rows, np.concatenate([target.real, target.imag]))[0]
+        # real and imaginary parts of products of white lines have half of their variance each
+        seen = float((scaled / np.sqrt(np.maximum(np.diag(np.linalg.pinv(rows.T @ rows)), 1.0) / 2)).max())
+        found = scaled / size
+    return found, seen
 
 
-def _made(driven: np.ndarray, power: np.ndarray) -> np.ndarray:
-    """Power of each sensor that noise of the inputs gives, (lines, outputs)."""
+def made(driven: np.ndarray, power: np.ndarray) -> np.ndarray:
+    """Power of each sensor that noise of the inputs gives, (lines, outputs).
+
+    Args:
+        driven: (lines, outputs, inputs) from the inputs.
+        power: (lines, inputs) of the noise.
+    """
     return np.asarray(np.einsum("lpi,li->lp", np.abs(driven) ** 2, power))
 
 

@@ -90,13 +90,15 @@ def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Nois
         return _of_periods(model, record, period)
     again = [x for x in others if _same_input(record, x)]
     if again:
-        pair = (record, again[0])
-        apart = (np.asarray(pair[0].y) - np.asarray(pair[1].y)) / np.sqrt(2)
-        return _of_signals(model, _without_input(record, _still(model, record, apart)), SOURCES[1])
+        u, y = (
+            (np.asarray(a) - np.asarray(b)) / np.sqrt(2)
+            for a, b in ((record.u, again[0].u), (record.y, again[0].y))
+        )
+        return _of_signals(model, _part(record, u, _still(model, record, y)), SOURCES[1])
     quiet = quiet_part(np.asarray(record.u))
     if quiet is not None:
         y = _still(model, record, np.asarray(record.y)[quiet])
-        return _of_signals(model, _without_input(record, y), SOURCES[2])
+        return _of_signals(model, _part(record, np.zeros((len(y), len(record.inputs))), y), SOURCES[2])
     return floor(spectra_of(model, record))
 
 
@@ -145,8 +147,7 @@ def quiet_part(u: Float[np.ndarray, "samples inputs"]) -> slice | None:
     return slice(0, first) if first >= SHORTEST else None
 
 
-def _without_input(record: Record, y: np.ndarray) -> Record:
-    u = np.zeros((len(y), len(record.inputs)))
+def _part(record: Record, u: np.ndarray, y: np.ndarray) -> Record:
     return Record(
         u, y, record.dt, inputs=record.inputs, outputs=record.outputs, hold=record.hold, name=record.name
     )
@@ -154,12 +155,16 @@ def _without_input(record: Record, y: np.ndarray) -> Record:
 
 def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
     count = len(record.u) // period
-    y = np.asarray(record.y)[-count * period :]
+    u, y = (np.asarray(x)[-count * period :] for x in (record.u, record.y))
+    # what inputs measured differ by, the model is driven with: noise of theirs is in what it leaves
+    other = ((u[period:] - u[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
     apart = _still(model, record, (y[period:] - y[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
-    signals = np.stack([_cleared(spectra_of(model, _without_input(record, x))) for x in apart])
+    signals = np.stack(
+        [_cleared(spectra_of(model, _part(record, *x))) for x in zip(other, apart, strict=True)]
+    )
     # what a law beside the model does to free responses dies out from period to period
-    level = np.sqrt(np.nanmean(signals**2, axis=1))
-    used = (level <= SAME_PERIOD * np.nanmin(level, axis=0)) | np.isnan(level)
+    level = np.sqrt((signals**2).mean(axis=1))
+    used = (level <= SAME_PERIOD * level.min(axis=0)) | np.isnan(level)
     return _fitted(signals[used.all(axis=1)] if used.all(axis=1).any() else signals[-1:], SOURCES[0])
 
 

@@ -18,7 +18,8 @@ from jaxtyping import Float
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
 from jaxsid.gap.innovations import coherence, innovations, unsteadiness
-from jaxsid.gap.input_noise import LARGEST, InputNoise, input_noise, refitted, whitening
+from jaxsid.gap.input_noise import CERTAIN, LARGEST, InputNoise, input_noise, made, refitted, whitening
+from jaxsid.gap.noise import BANDS
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
 from jaxsid.gap.recalibrate import Linear, Recalibrated
@@ -35,7 +36,8 @@ LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = (
     0.1  # of what noise of inputs leaves: what tests may take for a law, as the motion has that noise too
 )
-HEARD = 30.0  # power of an input next to that of its noise from which on a line tells of laws
+HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
+MARGIN = 1.5  # times what it does on others that a law's share must be to be asked of those too
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
 
@@ -60,7 +62,7 @@ class Null(NamedTuple):
         p_value: of all tests together, by Holm's rule.
         share: rms of the most that any test found for certain, next to that of the response.
         tests: each alone.
-        input_noise: of each measured input, rms next to its own, where that is what sensors have in common; else 0.
+        input_noise: of each measured input, rms next to its own, where sensors certainly have that in common; else 0.
     """
 
     p_value: float
@@ -102,7 +104,9 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
         if noise
         else (0.0,) * len(fit.model.inputs)
     )
-    return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests), each)
+    return Null(
+        min(1.0, worst.p_value * len(tests)), share, tuple(tests), tuple(np.max(each, axis=0).tolist())
+    )
 
 
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
@@ -122,32 +126,56 @@ def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
 def _laws(
     fit: Recalibrated, settings: tuple[Setting, ...], places: tuple[Place, ...], noise: tuple[InputNoise, ...]
 ) -> list[Test]:
-    """An F test for the shapes of each place; of sensors and inputs, which filters may be, on lines with an input."""
-    heard = [_heard(s, of) for s, of in zip(settings, noise or [None] * len(settings), strict=True)]
-    loud = tuple(
-        eqx.tree_at(lambda s: s.scale, s, s.scale * h[:, None]) for s, h in zip(settings, heard, strict=True)
-    )
-    gram, told = _grams(fit, settings, places, noise), float(np.mean(np.concatenate(heard)))
-    again = _grams(fit, loud, places, noise) if told < 1 else gram
-    every = fit, fit._replace(equations=int(fit.equations * told))
-    return [
-        _shapes_test(f"law at {p.label}", *((g, every[0]) if p.where == "between" else (a, every[1])))
-        for p, g, a in zip(places, gram, again, strict=True)
-    ]
+    """An F test for the shapes of each place.
 
-
-def _heard(setting: Setting, noise: InputNoise | None) -> Float[np.ndarray, " lines"]:
-    """1 where some input is above its noise, else 0: what noise in a record alone would do, bodies never did.
-
-    One sensor has nothing in common with another that would tell of such noise: it may be as loud as any.
+    On all lines where it finds more than noise of the inputs would do on those where they are hardly above it: what is
+    in a record alone never moved the bodies, which a law of its shapes may seem to say. Else on the others.
     """
+    power = [_input_power(s, of) for s, of in zip(settings, noise or [None] * len(settings), strict=True)]
+    heard = [_heard(s, p) for s, p in zip(settings, power, strict=True)]
+    gram, told = _grams(fit, settings, places, noise), float(np.mean(np.concatenate(heard)))
+    every = [_shapes_test(f"law at {p.label}", g, fit) for p, g in zip(places, gram, strict=True)]
+    if told == 1:
+        return every
+    loud = [
+        eqx.tree_at(lambda s: s.scale, s, s.scale * h[:, None]) for s, h in zip(settings, heard, strict=True)
+    ]
+    gram, part = _grams(fit, tuple(loud), places, noise), fit._replace(equations=int(fit.equations * told))
+    again = [_shapes_test(x.name, g, part) for x, g in zip(every, gram, strict=True)]
+    most = MARGIN * _unheard_share(fit, settings, power, heard)
+    return [a if a.share > most else b for a, b in zip(every, again, strict=True)]
+
+
+def _input_power(setting: Setting, noise: InputNoise | None) -> Float[np.ndarray, "lines inputs"]:
+    """Of the noise of inputs: found in what sensors have in common, else as much as each input's quietest band allows.
+
+    Little of it in a record seems to tell of a law of the input; much is to be found in what loud sensors read.
+    """
+    if noise is not None:
+        return noise.power
+    power = np.abs(np.asarray(setting.spectra.u)) ** 2
+    quiet = np.min([x.mean(axis=0) for x in np.array_split(power[1:], BANDS)], axis=0)
+    return np.broadcast_to(np.minimum(quiet, LARGEST**2 * power.mean(axis=0)), power.shape)
+
+
+def _heard(setting: Setting, power: Float[np.ndarray, "lines inputs"]) -> Float[np.ndarray, " lines"]:
+    """1 where some input is well above its noise, else 0."""
     u = jnp.asarray(setting.spectra.u)
     level = np.asarray(line_level(u, jnp.ones(u.shape))) ** 2
-    if noise is not None:
-        return np.asarray((level > HEARD * noise.power).any(axis=1) * 1.0)
-    alone = np.asarray(setting.spectra.present).sum() == 1
-    least = LARGEST**2 * np.asarray(jnp.abs(u) ** 2).mean(axis=0)
-    return np.asarray((level > least).any(axis=1) * 1.0) if alone else np.ones(len(level))
+    return np.asarray((level > HEARD * power).any(axis=1) * 1.0)
+
+
+def _unheard_share(
+    fit: Recalibrated, settings: Sequence[Setting], power: Sequence[np.ndarray], heard: Sequence[np.ndarray]
+) -> float:
+    """What noise of the inputs does on lines where they are hardly above it, in the measure of tests of laws."""
+    done, size = 0.0, 0.0
+    for setting, linear, p, h in zip(settings, fit.linear, power, heard, strict=True):
+        scale = np.asarray(setting.scale)
+        every = made(np.asarray(setting.spectra.driven) * scale[:, :, None], p)
+        done += float(((1 - h)[:, None] * every).sum())
+        size += float((np.abs(np.asarray(linear.left) * scale) ** 2).sum())
+    return np.sqrt(done / max(size, np.finfo(float).tiny)) * left_share(fit)
 
 
 def _grams(
@@ -202,20 +230,17 @@ def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:
 
 def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> tuple[tuple[InputNoise, ...], list[Test]]:
     """Noise of the inputs, where sensors have it in common; whether the rest is each sensor's own, and steady."""
-    white = [innovations(s, x) for s, x in zip(settings, fit.linear, strict=True)]
-    noise: tuple[InputNoise, ...] = ()
-    common = coherence(white)
-    if common.p_value < DOUBT:
-        noise = tuple(input_noise(s, x) for s, x in zip(settings, fit.linear, strict=True))
-        noise = noise if any(x.power.any() for x in noise) and all(x.plausible for x in noise) else ()
-    if noise:
-        linear = refitted(settings, fit.linear, noise)
+    linear = fit.linear
+    noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
+    if all(x.plausible for x in noise):
+        linear = refitted(settings, linear, noise)
         noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
         white = [innovations(*x) for x in zip(settings, linear, noise, strict=True)]
-        common = coherence(white)
+    else:
+        noise, white = (), [innovations(s, x) for s, x in zip(settings, linear, strict=True)]
     left, found = left_shares(fit), {CHANGE: unsteadiness(white)}
     if any(e.any(axis=0).sum() > 1 for e in white):
-        found[COMMON] = common
+        found[COMMON] = coherence(white)
     share = lambda x: float(np.sqrt(x.part) * np.prod(left[list(x.sensors)]) ** (1 / max(len(x.sensors), 1)))  # noqa: E731
     return noise, [Test(name, x.p_value, share(x)) for name, x in found.items()]
 
@@ -254,7 +279,8 @@ def left_shares(fit: Recalibrated) -> Float[np.ndarray, " outputs"]:
 
 
 def _mean(shares: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(shares**2)))
+    known = shares[np.isfinite(shares)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
 
 
 def _lone_line(fit: Recalibrated) -> Test:

@@ -146,12 +146,14 @@ def about_numbers(found: Examination) -> list[str]:
 
 
 def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
-    """Inputs whose own noise is what sensors have in common.
+    """Inputs whose own noise is what sensors have in common; where there is more in what is left, that is no more told.
 
     Args:
         model: names them.
         found: the examination.
     """
+    if found.finding == "structure":
+        return []
     return [
         f"What is left of all sensors is in common what noise of the measured '{x.name}', {percent(part)} of its rms, "
         "would leave. That counts as noise."
