@@ -99,14 +99,9 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
         tests.append(_power(fit))
     worst = min(tests, key=lambda t: t.p_value)
     share = max(t.share for t in tests if t is worst or t.p_value * len(tests) < SIGNIFICANT)
-    each = (
-        tuple(np.max([x.relative for x in noise], axis=0).tolist())
-        if noise
-        else (0.0,) * len(fit.model.inputs)
-    )
-    return Null(
-        min(1.0, worst.p_value * len(tests)), share, tuple(tests), tuple(np.max(each, axis=0).tolist())
-    )
+    told = [x.relative for x in noise if x.seen > CERTAIN] or [np.zeros(len(fit.model.inputs))]
+    relative = tuple(np.max(told, axis=0).tolist())
+    return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests), relative)
 
 
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
