@@ -55,19 +55,23 @@ class InputNoise(NamedTuple):
         return self.seen > SEEN and bool((self.relative <= LARGEST).all())
 
 
-def input_noise(setting: Setting, linear: Linear) -> InputNoise:
+def input_noise(setting: Setting, linear: Linear, start: InputNoise | None = None) -> InputNoise:
     """The noise of inputs, and each sensor's own, that best give what is left.
 
     Args:
         setting: its scale is one over the level of what is left at each line.
         linear: the model beside the record.
+        start: what was found before the model was fitted anew beside it.
     """
     scale = np.asarray(setting.scale)
     left, driven = np.asarray(linear.left) * scale, np.asarray(setting.spectra.driven) * scale[:, :, None]
     parts = np.array_split(np.arange(len(left)), PARTS)
-    white, seen = _white(left, driven)
-    power = np.broadcast_to(white, (len(left), len(white))).copy()
-    own = np.maximum(1 - _around(made(driven, power)), LEAST)
+    if start is None:
+        white, seen = _white(left, driven)
+        power = np.broadcast_to(white, (len(left), len(white))).copy()
+        own = np.maximum(1 - _around(made(driven, power)), LEAST)
+    else:
+        power, own, seen = start.power.copy(), start.own, start.seen
     for _ in range(ROUNDS):
         gain = (driven * power[:, None, :]).conj().transpose(0, 2, 1) @ np.linalg.inv(
             _covariance(driven, power, own)

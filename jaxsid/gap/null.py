@@ -229,7 +229,7 @@ def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> tuple[tuple[InputN
     noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
     if all(x.plausible for x in noise):
         linear = refitted(settings, linear, noise)
-        noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
+        noise = tuple(input_noise(*x) for x in zip(settings, linear, noise, strict=True))
         white = [innovations(*x) for x in zip(settings, linear, noise, strict=True)]
     else:
         noise, white = (), [innovations(s, x) for s, x in zip(settings, linear, strict=True)]
