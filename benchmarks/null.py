@@ -3,7 +3,8 @@
     .venv/bin/python benchmarks/null.py OUT.jsonl [CASES]
 
 simulates random systems by scipy, their numbers drawn from within the tolerance, with white or coloured noise whose
-level nobody tells, a third of them with noise of the measured input too, and writes a line a case. A second run goes on where the first stopped; it prints a summary.
+level nobody tells, a third of them with noise of the measured input too, and writes a line a case. A second run goes on
+where the first stopped; it prints a summary.
 """
 
 import json
