@@ -50,7 +50,7 @@ from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
-WORTH = 6.0  # tempered gain of evidence from which on a further effect is taken
+WORTH, TELLING = 6.0, 4.0  # tempered gain of evidence from which on an effect is taken, and a number of the model
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 LESS = 0.1  # part of what is left above the noise that a further effect must remove
@@ -451,7 +451,7 @@ def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         if not candidates:
             return at
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
-        if ranking.gain <= WORTH:
+        if ranking.gain <= TELLING:
             at = at.refused(ranking)
             break
         at = at.taken(ranking)
