@@ -50,7 +50,7 @@ from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
-WORTH, TELLING = 6.0, 4.0  # tempered gain of evidence from which on an effect is taken, and a number of the model
+WORTH, TELLING = 6.0, 4.0  # tempered gain of evidence from which on effects, and numbers, are taken
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
 LESS = 0.1  # part of what is left above the noise that a further effect must remove

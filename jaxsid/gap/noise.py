@@ -15,7 +15,7 @@ from jaxsid.gap.decay import without_decays
 from jaxsid.gap.spectra import Spectra, spectra_of
 from jaxsid.impulse.whitening import MOST, whitening_filter
 from jaxsid.mechanics.first_order import physical_displacement_velocity
-from jaxsid.mechanics.lumped import LumpedModel, second_order
+from jaxsid.mechanics.lumped import LumpedModel, free_bodies, second_order
 from jaxsid.mechanics.simulate import measured_sensors
 from jaxsid.records import Record
 
@@ -94,7 +94,7 @@ def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Nois
             (np.asarray(a) - np.asarray(b)) / np.sqrt(2)
             for a, b in ((record.u, again[0].u), (record.y, again[0].y))
         )
-        return _of_signals(model, _part(record, u, _still(model, record, y)), SOURCES[1])
+        return _of_signals(model, _part(record, _felt(model, u), _still(model, record, y)), SOURCES[1])
     quiet = quiet_part(np.asarray(record.u))
     if quiet is not None:
         y = _still(model, record, np.asarray(record.y)[quiet])
@@ -147,6 +147,14 @@ def quiet_part(u: Float[np.ndarray, "samples inputs"]) -> slice | None:
     return slice(0, first) if first >= SHORTEST else None
 
 
+def _felt(model: LumpedModel, u: np.ndarray) -> np.ndarray:
+    """What inputs that should be one differ by: the model is driven with it, so that their noise is in what it leaves.
+
+    Nothing where bodies are free: there it drifts far away, and friction takes up most of it.
+    """
+    return np.zeros_like(u) if free_bodies(model).shape[1] else u
+
+
 def _part(record: Record, u: np.ndarray, y: np.ndarray) -> Record:
     return Record(
         u, y, record.dt, inputs=record.inputs, outputs=record.outputs, hold=record.hold, name=record.name
@@ -156,8 +164,7 @@ def _part(record: Record, u: np.ndarray, y: np.ndarray) -> Record:
 def _of_periods(model: LumpedModel, record: Record, period: int) -> Noise:
     count = len(record.u) // period
     u, y = (np.asarray(x)[-count * period :] for x in (record.u, record.y))
-    # what inputs measured differ by, the model is driven with: noise of theirs is in what it leaves
-    other = ((u[period:] - u[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
+    other = _felt(model, (u[period:] - u[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
     apart = _still(model, record, (y[period:] - y[:-period]) / np.sqrt(2)).reshape(count - 1, period, -1)
     signals = np.stack(
         [_cleared(spectra_of(model, _part(record, *x))) for x in zip(other, apart, strict=True)]
