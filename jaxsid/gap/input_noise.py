@@ -51,12 +51,12 @@ class InputNoise(NamedTuple):
 
     @property
     def plausible(self) -> bool:
-        """Whether it may be there, and is no more than what sensors of inputs may have."""
-        return self.seen > SEEN and bool((self.relative <= LARGEST).all())
+        """Whether it is no more than what sensors of inputs may have."""
+        return bool((self.relative <= LARGEST).all())
 
 
 def input_noise(setting: Setting, linear: Linear, start: InputNoise | None = None) -> InputNoise:
-    """The noise of inputs, and each sensor's own, that best give what is left.
+    """The noise of inputs, and each sensor's own, that best give what is left; none where sensors hardly tell of it.
 
     Args:
         setting: its scale is one over the level of what is left at each line.
@@ -68,11 +68,11 @@ def input_noise(setting: Setting, linear: Linear, start: InputNoise | None = Non
     parts = np.array_split(np.arange(len(left)), PARTS)
     if start is None:
         white, seen = _white(left, driven)
-        power = np.broadcast_to(white, (len(left), len(white))).copy()
+        power = np.broadcast_to(white * (seen > SEEN), (len(left), len(white))).copy()
         own = np.maximum(1 - _around(made(driven, power)), LEAST)
     else:
         power, own, seen = start.power.copy(), start.own, start.seen
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if power.any() else 0):
         gain = (driven * power[:, None, :]).conj().transpose(0, 2, 1) @ np.linalg.inv(
             _covariance(driven, power, own)
         )

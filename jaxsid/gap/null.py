@@ -33,9 +33,7 @@ DOUBT = 0.05  # likewise, from which on nothing speaks for it either
 COMMON, CHANGE = "common to sensors", "change with time"
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
-CARRIED = (
-    0.1  # of what noise of inputs leaves: what tests may take for a law, as the motion has that noise too
-)
+CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
 HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
 MARGIN = 1.5  # times what it does on others that a law's share must be to be asked of those too
 DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
@@ -144,9 +142,9 @@ def _laws(
 def _input_power(setting: Setting, noise: InputNoise | None) -> Float[np.ndarray, "lines inputs"]:
     """Of the noise of inputs: found in what sensors have in common, else as much as each input's quietest band allows.
 
-    Little of it in a record seems to tell of a law of the input; much is to be found in what loud sensors read.
+    Beside loud sensors their products do not show it, but sums over lines where an input is nothing else do.
     """
-    if noise is not None:
+    if noise is not None and noise.power.any():
         return noise.power
     power = np.abs(np.asarray(setting.spectra.u)) ** 2
     quiet = np.min([x.mean(axis=0) for x in np.array_split(power[1:], BANDS)], axis=0)
@@ -227,7 +225,7 @@ def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> tuple[tuple[InputN
     """Noise of the inputs, where sensors have it in common; whether the rest is each sensor's own, and steady."""
     linear = fit.linear
     noise = tuple(input_noise(s, x) for s, x in zip(settings, linear, strict=True))
-    if all(x.plausible for x in noise):
+    if any(x.power.any() for x in noise) and all(x.plausible for x in noise):
         linear = refitted(settings, linear, noise)
         noise = tuple(input_noise(*x) for x in zip(settings, linear, noise, strict=True))
         white = [innovations(*x) for x in zip(settings, linear, noise, strict=True)]

@@ -146,7 +146,7 @@ def about_numbers(found: Examination) -> list[str]:
 
 
 def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
-    """Inputs whose own noise is what sensors have in common; where there is more in what is left, that is no more told.
+    """Inputs whose own noise is what sensors have in common; nothing where more is left, which hides how much it is.
 
     Args:
         model: names them.
@@ -155,8 +155,8 @@ def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
     if found.finding == "structure":
         return []
     return [
-        f"What is left of all sensors is in common what noise of the measured '{x.name}', {percent(part)} of its rms, "
-        "would leave. That counts as noise."
+        f"The sensors have in common what noise of the measured '{x.name}', {percent(part)} of its rms, leaves in all "
+        "of them. It counts as noise."
         for x, part in zip(model.inputs, found.null.input_noise, strict=True)
         if part > 0
     ]
