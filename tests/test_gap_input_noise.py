@@ -170,4 +170,5 @@ def test_the_rig_agrees_with_its_own_numbers_though_its_torque_is_measured_with_
     torque = drive(4096, 7) / 10 * 3
     found = examine(rig(), [rig_record(1, demand=torque, torque_noise=0.01)])
     assert found.finding == "agreement"
+    assert found.structural_p_value > 0.01
     assert found.null.input_noise == pytest.approx([0.01], rel=0.15)

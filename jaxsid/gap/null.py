@@ -90,7 +90,7 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
     noise, own = _own(fit, leveled)
     carried = CARRIED * max((_mean(left_shares(fit) * x.share) for x in noise), default=0.0)
     sought = [*_laws(fit, leveled, tuple(places), noise), *_steady(fit, leveled)]
-    tests = [x._replace(share=float(np.sqrt(max(x.share**2 - carried**2, 0.0)))) for x in sought]
+    tests = [_beyond(x, carried) for x in sought]
     tests.append(_lone_line(fit))
     tests += [] if deflated else own
     if all(n.degrees > 0 for n in fit.noises):
@@ -100,6 +100,13 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
     told = [x.relative for x in noise if x.seen > CERTAIN] or [np.zeros(len(fit.model.inputs))]
     relative = tuple(np.max(told, axis=0).tolist())
     return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests), relative)
+
+
+def _beyond(test: Test, carried: float) -> Test:
+    """What a test finds beyond what noise of the inputs may give it: as good as chance where that is all."""
+    if 0 < test.share <= carried:
+        return test._replace(p_value=1.0, share=0.0)
+    return test._replace(share=float(np.sqrt(test.share**2 - min(carried, test.share) ** 2)))
 
 
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
