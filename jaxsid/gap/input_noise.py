@@ -1,4 +1,4 @@
-"""Noise of measured inputs: what a model makes of it is in what it leaves, and common to all sensors.
+"""Noise of measured inputs: what a model makes of it is left, common to all sensors and with the peaks of the model.
 
 A recorded input u + n drives the model with n too, so that it leaves r = e - H n, with e each sensor's own. Where that
 is all, lines of r have the covariance R = H s H' + diag(own), with s the powers of n. Powers are found by the largest
@@ -67,7 +67,7 @@ def input_noise(setting: Setting, linear: Linear, start: InputNoise | None = Non
     left, driven = np.asarray(linear.left) * scale, np.asarray(setting.spectra.driven) * scale[:, :, None]
     parts = np.array_split(np.arange(len(left)), PARTS)
     if start is None:
-        white, seen = _white(left, driven)
+        white, seen = _white(left, driven, scale)
         power = np.broadcast_to(white * (seen > SEEN), (len(left), len(white))).copy()
         own = np.maximum(1 - _around(made(driven, power)), LEAST)
     else:
@@ -140,17 +140,26 @@ def _columns(setting: Setting, linear: Linear, noise: InputNoise) -> list[np.nda
     return [*rows[:2], rows[2][:, 0]]
 
 
-def _white(left: np.ndarray, driven: np.ndarray) -> tuple[np.ndarray, float]:
-    """Powers (inputs,) of white noise that best give products of two sensors, which their own noise does not enter.
+def _white(left: np.ndarray, driven: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, float]:
+    """Powers (inputs,) of white noise that best give products of sensors, and the largest in its standard deviations.
 
-    And the largest in its standard deviations. Products are weighed by the powers that those found before give.
+    Those of two sensors, which their own noise does not enter; of one alone the square, next to what is around it: its
+    own noise is smooth there, while what noise of the inputs makes has the peaks and dips of the model. Products are
+    weighed by the powers that those found before give.
     """
-    pairs, inputs = list(combinations(np.flatnonzero(left.any(axis=0)), 2)), driven.shape[2]
+    present, inputs = np.flatnonzero(left.any(axis=0)), driven.shape[2]
+    alone = len(present) == 1
+    pairs = [(present[0], present[0])] if alone else list(combinations(present, 2))
     found, seen = np.zeros(inputs), 0.0
     if not pairs:
         return found, seen
     a, b = np.array(pairs).T
     columns, common = driven[:, a] * driven[:, b].conj(), left[:, a] * left[:, b].conj()
+    if alone:
+        columns = columns - _beside(np.abs(columns[:, 0]), scale[:, a])[:, None]
+        common = common - _beside(np.abs(common), scale[:, a])
+    # products of white lines have a variance of one; real and imaginary parts of those of two sensors have half of it
+    variance = 1.0 if alone else 0.5
     for _ in range(WEIGHED):
         of = made(driven, np.broadcast_to(found, (len(left), inputs)))
         power = np.maximum(1 - _around(of), LEAST) + of
@@ -160,8 +169,8 @@ def _white(left: np.ndarray, driven: np.ndarray) -> tuple[np.ndarray, float]:
         size = np.linalg.norm(rows, axis=0)
         rows, size = rows / np.where(size > 0, size, 1.0), np.where(size > 0, size, np.inf)
         scaled = nnls(rows, np.concatenate([target.real, target.imag]))[0]
-        # real and imaginary parts of products of white lines have half of their variance each
-        seen = float((scaled / np.sqrt(np.maximum(np.diag(np.linalg.pinv(rows.T @ rows)), 1.0) / 2)).max())
+        each = np.maximum(np.diag(np.linalg.pinv(rows.T @ rows)), 1.0)
+        seen = float((scaled / np.sqrt(variance * each)).max())
         found = scaled / size
     return found, seen
 
@@ -184,6 +193,11 @@ def _covariance(driven: np.ndarray, power: np.ndarray, own: np.ndarray) -> np.nd
 def _around(power: np.ndarray) -> np.ndarray:
     """Mean of powers over neighbouring lines."""
     return np.asarray(line_level(jnp.sqrt(power) + 0j, jnp.ones(power.shape))) ** 2
+
+
+def _beside(power: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Likewise, without the scale, whose own chance both sides of an equation would have in common."""
+    return _around(np.divide(power, scale**2, out=np.zeros_like(power), where=scale > 0)) * scale**2
 
 
 def _relative(setting: Setting, power: np.ndarray) -> np.ndarray:

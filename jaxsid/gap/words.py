@@ -146,7 +146,7 @@ def about_numbers(found: Examination) -> list[str]:
 
 
 def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
-    """Inputs whose own noise is what sensors have in common; nothing where more is left, which hides how much it is.
+    """Inputs whose own noise is in what is left; nothing where more is left, which hides how much it is.
 
     Args:
         model: names them.
@@ -155,8 +155,8 @@ def about_inputs(model: LumpedModel, found: Examination) -> list[str]:
     if found.finding == "structure":
         return []
     return [
-        f"The sensors have in common what noise of the measured '{x.name}', {percent(part)} of its rms, leaves in all "
-        "of them. It counts as noise."
+        f"What is left holds what noise of the measured '{x.name}', {percent(part)} of its rms, makes the model do, as "
+        "would a random force as small beside it. It counts as noise."
         for x, part in zip(model.inputs, found.null.input_noise, strict=True)
         if part > 0
     ]
