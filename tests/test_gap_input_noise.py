@@ -13,7 +13,7 @@ from jaxsid.gap.examine import examine
 from jaxsid.gap.innovations import coherence, innovations
 from jaxsid.gap.input_noise import CERTAIN, LARGEST, input_noise, refitted, whitening
 from jaxsid.gap.noise import noise_of
-from jaxsid.gap.null import COMMON, _leveled
+from jaxsid.gap.null import COMMON, _leveled, _lone_line
 from jaxsid.gap.recalibrate import as_given, recalibrated
 from jaxsid.mechanics.lumped import Input
 from jaxsid.records import Record
@@ -107,6 +107,27 @@ def test_a_measured_drive_is_agreement():
     found = examine(chain(), [measured(0.01)])
     assert found.finding == "agreement"
     assert found.null.input_noise == pytest.approx([0.01], rel=0.15)
+
+
+@pytest.mark.parametrize("one", [False, True])
+def test_its_resonances_are_no_lone_frequency(one):
+    """Of springs that are damped little: where noise of the input is not allowed for they are."""
+    model = replace(chain(), damping=0.3 * chain().damping)
+    before, after = [], []
+    for seed in range(5):
+        u, rng = drive(SAMPLES, seed), np.random.default_rng(seed)
+        lines = as_given(
+            model, [record(u, np.zeros((SAMPLES, 3)))], noise_of(model, [measured(0, seed)])
+        ).settings
+        y = np.fft.irfft(np.asarray(lines[0].spectra.response) * np.sqrt(SAMPLES), SAMPLES, axis=0)
+        r = record(u + 0.01 * u.std() * rng.standard_normal(SAMPLES), noisy(y, 0.003, seed))
+        r = alone(r) if one else r
+        fit = recalibrated(model, [r], noise_of(model, [r]), wide=True)
+        setting, linear = _leveled(fit.settings[0], fit.linear[0]), fit.linear[0]
+        before.append(_lone_line(fit, (setting,), ()).p_value)
+        after.append(_lone_line(fit, (setting,), (input_noise(setting, linear),)).p_value)
+    assert min(before) < 1e-4
+    assert min(after) > 0.01
 
 
 def test_more_than_a_sensor_of_inputs_has_is_a_gap():

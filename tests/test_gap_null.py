@@ -14,7 +14,7 @@ SAMPLES = 800
 def lone(y):
     noise = known(np.ones(3))
     noise.taps[:, 1:] = 0.0
-    return _lone_line(as_given(chain(), [record(np.zeros(len(y)), y)], [noise]))
+    return _lone_line(as_given(chain(), [record(np.zeros(len(y)), y)], [noise]), (), ())
 
 
 def white(seed):

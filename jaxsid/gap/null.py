@@ -91,7 +91,7 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
     carried = CARRIED * max((_mean(left_shares(fit) * x.share) for x in noise), default=0.0)
     sought = [*_laws(fit, leveled, tuple(places), noise), *_steady(fit, leveled)]
     tests = [_beyond(x, carried) for x in sought]
-    tests.append(_lone_line(fit))
+    tests.append(_lone_line(fit, leveled, noise))
     tests += [] if deflated else own
     if all(n.degrees > 0 for n in fit.noises):
         tests.append(_power(fit))
@@ -283,19 +283,23 @@ def _mean(shares: np.ndarray) -> float:
     return float(np.sqrt((known**2).mean())) if len(known) else 0.0
 
 
-def _lone_line(fit: Recalibrated) -> Test:
+def _lone_line(fit: Recalibrated, leveled: tuple[Setting, ...], noise: tuple[InputNoise, ...]) -> Test:
     """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees.
 
     Lines are those of Hann's window, so that a frequency between two of them has no skirts; of those around it the
-    nearest are left out, and of the others every second, which share nothing. It must stand out from either side.
+    nearest are left out, and of the others every second, which share nothing. It must stand out from either side, and
+    from noise of the inputs, that has the model's resonances.
     """
     apart = np.arange(-AROUND, AROUND + 1)
     below = ((apart >= GUARD) & (apart % 2 == GUARD % 2)).astype(float)
     every = []
-    for setting, linear in zip(fit.settings, fit.linear, strict=True):
+    beyond = (
+        [_beyond_inputs(*x) for x in zip(leveled, noise, strict=True)] if noise else [1.0] * len(fit.settings)
+    )
+    for setting, linear, size in zip(fit.settings, fit.linear, beyond, strict=True):
         used = np.asarray(setting.spectra.weight) == 1
         left = np.asarray(linear.left)[used][:, np.asarray(setting.spectra.present) > 0]
-        lines = left * np.asarray(setting.scale)[used][:, np.asarray(setting.spectra.present) > 0]
+        lines = left * (np.asarray(setting.scale) / size)[used][:, np.asarray(setting.spectra.present) > 0]
         power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
         # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
         whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
@@ -309,6 +313,12 @@ def _lone_line(fit: Recalibrated) -> Test:
     p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
     share = np.sqrt(part[alone.argmin()]) * left_share(fit)
     return Test("lone frequency", p, float(share))
+
+
+def _beyond_inputs(setting: Setting, noise: InputNoise) -> Float[np.ndarray, "lines outputs"]:
+    """Rms of all noise next to that of each sensor's own."""
+    driven = np.asarray(setting.spectra.driven) * np.asarray(setting.scale)[:, :, None]
+    return np.sqrt(1 + made(driven, noise.power) / noise.own)
 
 
 def _sums(x: np.ndarray, around: np.ndarray) -> np.ndarray:
