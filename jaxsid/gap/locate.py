@@ -223,8 +223,8 @@ def _remarks(across: np.ndarray, likely: Sequence[int], places: tuple[Place, ...
     said = []
     if np.isnan(across).all():
         said.append(
-            "One sensor: a force at any place could explain what is left, so that only its shape tells where it acts. "
-            "A second sensor would tell more."
+            "One sensor at a time: a force at any place could explain what is left, so that only its shape tells where "
+            "it acts. Two at once would tell more."
         )
     elif np.nanmin(across) > UNEXPLAINED:
         said.append(
