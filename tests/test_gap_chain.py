@@ -9,6 +9,7 @@ from gap_helpers import with_effect as truth
 from jaxsid.gap.chain import Chain, Links
 from jaxsid.gap.fit import _evaluated, _led, _normal, links_of
 from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of, tied
+from jaxsid.gap.setting import LARGE
 from jaxsid.mechanics.lumped import Effect
 
 CUBIC = Effect("cubic_stiffness", (("between", ("b1", "b2")),), {"coefficient": 4e5})
@@ -112,6 +113,25 @@ def test_tied_windows_end_where_the_next_begin(records, apart):
     # the states of many windows cost less, and what they leave is no more than noise
     assert found.deviations[0]["coefficient"] <= apart.deviations[0]["coefficient"]
     assert found.fit.squares < 1.1 * found.fit.equations
+
+
+@pytest.mark.parametrize(
+    ("kind", "where", "place"),
+    [("actuator_lag", ("input", "drive"), 0), ("sensor_lag", ("sensor", "s1"), 1)],
+)
+def test_a_lagging_signal_is_carried_from_window_to_window_in_its_own_unit(kind, where, place):
+    """Newtons are no metres: held to what bodies move by, the lag's state would tear the chain."""
+    of = bench(*colored(truth(drive(), kind, place, {"time_constant": 0.02}), 3))
+    near = refitted(of, Hypothesis((Effect(kind, (where,), {"time_constant": 0.015}),)))
+    chained, found = tied(of, near, steps=25)
+    assert np.isfinite(chained.jump)
+    assert found.fit.evidence > near.fit.evidence + 50
+    (value,) = (float(e.parameters["time_constant"]) for e in found.hypothesis.effects)
+    assert abs(value - 0.02) < 4 * found.deviations[0]["time_constant"]
+    assert found.fit.squares < 1.1 * found.fit.equations
+    signal = {"input": of.moved[0].u[:, 0], "sensor": of.moved[0].y[:, 1]}[where[0]]
+    rms = np.sqrt((np.asarray(signal) ** 2).mean())
+    np.testing.assert_allclose(of.state_deviations(found.hypothesis.effects)[6:], LARGE * rms)
 
 
 def test_windows_stay_apart_where_the_model_is_wrong(records):

@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
-from gap_helpers import SAMPLES, chain, drive, exact, noisy, record, with_effect
+from gap_helpers import DT, SAMPLES, chain, drive, exact, noisy, record, with_effect
+from scipy.signal import cont2discrete
 
 from jaxsid import diagnose
+from jaxsid.gap.examine import examine
 from jaxsid.gap.held_out import FEWEST, HELD_OUT, LOUDER, later_ends, seen_part, usual_end
+from jaxsid.gap.later import later_than_agreed
+from jaxsid.mechanics.lumped import Connection, Input, Sensor, lumped_model, second_order
+from jaxsid.records import Record
 
 END = 3 * SAMPLES // 4
 B12 = {"between": ["b1", "b2"]}
@@ -62,6 +67,41 @@ def test_some_samples_always_stay(data):
     # nothing to compare with
     assert later_ends([data], [END], [0 * white(END)], [after]) == (END,)
     assert later_ends([data], [END], [np.nan * white(END)], [after]) == (END,)
+
+
+def test_what_comes_last_on_a_free_axis_is_seen_beside_its_drift():
+    """It drifts away by far more, which a long simulation would take for what is left of the samples seen."""
+    model = lumped_model(
+        ["b1", "b2"],
+        [1.0, 2.0],
+        [300.0],
+        [0.5],
+        connections=[Connection("joint", ("b1", "b2"))],
+        inputs=[Input("drive", "b1", "zero")],
+        sensors=[Sensor(f"v{b}", b, "velocity") for b in ("b1", "b2")],
+    )
+    plain = second_order(model)
+    M, D, K = (np.asarray(x) for x in (plain.mass, plain.damping, plain.stiffness))
+    inverse = np.linalg.inv(M)
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-inverse @ K, -inverse @ D]])
+    B = np.concatenate([np.zeros((2, 2)), inverse])
+    velocities = np.eye(4)[2:]
+    step = cont2discrete((A, B, velocities, np.zeros((2, 2))), DT)[:2]
+    rng, whole = np.random.default_rng(0), []
+    for burst in (0.0, 0.3):
+        pushes = np.column_stack([drive(), np.zeros(SAMPLES)])
+        pushes[END + 50 : END + 100, 1] = burst * pushes[:, 0].std()
+        x, y = np.zeros(4), []
+        for push in pushes:
+            y.append(x[2:])
+            x = step[0] @ x + step[1] @ push
+        y = np.array(y)
+        y += 0.001 * y.std(axis=0) * rng.standard_normal(y.shape)
+        whole.append(Record(pushes[:, :1], y, DT, inputs=("drive",), outputs=("vb1", "vb2"), name="free"))
+    seen = [[seen_part(r, END)] for r in whole]
+    ends = [later_than_agreed(model, s, [r], examine(model, s)) for s, r in zip(seen, whole, strict=True)]
+    assert ends[0] == (END,)
+    assert END + 50 < ends[1][0] < END + 150
 
 
 @pytest.mark.slow

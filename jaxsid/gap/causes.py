@@ -5,9 +5,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxsid.gap.closure import Closure, Left, closure_of, left_before, left_of, substantial
+from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
     ERRORS,
@@ -24,8 +23,8 @@ from jaxsid.gap.explain import (
     rank,
     rank_again,
 )
-from jaxsid.gap.held_out import later_ends
 from jaxsid.gap.hypothesis import FIXED
+from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored
 from jaxsid.gap.look import Look, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
@@ -74,8 +73,8 @@ class Causes(NamedTuple):
         lefts: what each of these leaves of these samples.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
-        later: how many samples of each record must be seen for all that it holds; as many as were where the selected
-            effects leave no more of the others.
+        later: how many samples of each record must be seen for all that it holds; as many as were where what was
+            chosen leaves no more of the others.
         noises: of each record; where it is guessed, what the chosen model leaves if tests find nothing in it, else no
             more than that.
         remaining: tests of what is left of the other samples.
@@ -140,7 +139,7 @@ def causes_of(
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before
-    linear = _freely(bench, changes_of(chosen, bench))
+    linear = best_linear(bench, changes_of(chosen, bench))
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
     say("how far the gap shrinks")
@@ -154,6 +153,10 @@ def causes_of(
     told = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
     floor = tuple(map(no_louder, told, steps[-1].left))
     *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
+    if selected:
+        later = later_than_effects(chosen, bench, whole, ends, each[-1])
+    else:
+        later = later_than_linear(found, linear, bench, whole, ends, before[1])
     return Causes(
         rounds,
         chosen,
@@ -167,7 +170,7 @@ def causes_of(
         look.null,
         None if look.clear else look.scored,
         before,
-        _later(chosen, bench, whole, ends, each[-1]) if selected else ends,
+        later,
     )
 
 
@@ -186,46 +189,9 @@ def _searched(
     if found.finding == "structure":
         at = _effects(start, model, seen, say)
     else:
-        within = refitted(start.bench, Hypothesis(), changes=_found_changes(found))
+        within = refitted(start.bench, Hypothesis(), changes=changes_found(found))
         at = start._replace(before=within, look=start.look._replace(scored=None))
     return _numbers(at, model, seen, say)
-
-
-def _freely(bench: Bench, changes: Float[np.ndarray, " e"]) -> Refit:
-    """The best linear model: all of its numbers may be far off."""
-    return refitted(bench, Hypothesis(wrong=tuple(range(len(bench.tolerance)))), changes=changes)
-
-
-def linear_left(
-    model: LumpedModel, seen: Sequence[Record], whole: Sequence[Record], found: Examination
-) -> Left:
-    """What the best linear model leaves of held-out samples, where records agree with it otherwise.
-
-    Args:
-        model: nominal; its effects are left out.
-        seen: records without their held-out ends.
-        whole: records as they are.
-        found: examination of the former.
-    """
-    bench, ends = bench_of(model, seen, found.noises, found.fit), [len(r.y) for r in seen]
-    linear = _freely(bench, _found_changes(found))
-    return left_of(linear, bench, whole, ends, windowed=is_free_or_unstable(model))
-
-
-def _later(
-    chosen: Refit, bench: Bench, whole: Sequence[Record], ends: tuple[int, ...], closure: Closure
-) -> tuple[int, ...]:
-    """Ends beyond which no window holds far more than those before them, see `later_ends`, where there is more."""
-    if not substantial(closure.after, closure.noise_floor):
-        return ends
-    after = left_of(chosen, bench, whole, ends, windowed=True)
-    return later_ends(whole, ends, left_before(chosen, bench), after.left)
-
-
-def _found_changes(found: Examination) -> Float[np.ndarray, " e"]:
-    """Relative changes of the elements of the best linear model."""
-    values, nominal = np.asarray(found.elements.values), np.asarray(found.elements.nominal)
-    return np.where(nominal != 0, values / np.where(nominal != 0, nominal, 1.0) - 1, 0.0)
 
 
 class _Found(NamedTuple):

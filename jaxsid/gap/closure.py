@@ -163,7 +163,7 @@ def _states(
     """Initial states of windows, all else as it is."""
     theta = found.fit.theta
     same = np.full(len(theta), FIXED)
-    states = bench.state_deviations(found.shot.slots.count)
+    states = bench.state_deviations(found.hypothesis.effects)
     least, most = np.full(len(theta), -np.inf), np.ones(len(theta))
     prior = Prior(same, theta, least, most, states, np.full(len(states), np.inf))
     begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]

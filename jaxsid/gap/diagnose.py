@@ -7,12 +7,13 @@ import numpy as np
 
 from jaxsid.checks import require
 from jaxsid.compilation import release_programs
-from jaxsid.gap.causes import Causes, causes_of, linear_left
+from jaxsid.gap.causes import Causes, causes_of
 from jaxsid.gap.closure import Closure
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.experiment import Experiment, experiment_between
 from jaxsid.gap.explain import ERRORS, element_place, elements_by_key
-from jaxsid.gap.held_out import later_ends, seen_part, usual_end
+from jaxsid.gap.held_out import seen_part, usual_end
+from jaxsid.gap.later import later_than_agreed
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
@@ -268,7 +269,8 @@ def diagnose(
     ends = tuple(map(usual_end, records))
     seen = tuple(map(seen_part, records, ends))
     found, causes, verdict = _judged(model, seen, records, progress)
-    if (later := _later(model, seen, records, found, causes)) != ends:
+    later = later_than_agreed(model, seen, records, found) if causes is None else causes.later
+    if later != ends:
         if progress is not None:
             progress("the last samples hold far more than all before: again with most of those")
         seen = tuple(map(seen_part, records, later))
@@ -291,21 +293,6 @@ def _judged(
     if found.finding != "agreement":
         causes = causes_of(model, seen, whole, found, progress=progress)
     return found, *concluded(found, causes)
-
-
-def _later(
-    model: LumpedModel,
-    seen: tuple[Record, ...],
-    whole: tuple[Record, ...],
-    found: Examination,
-    causes: Causes | None,
-) -> tuple[int, ...]:
-    """How many samples of each record must be seen to know what is there."""
-    if causes is not None and causes.selected:
-        return causes.later
-    before = [x.refit - x.measured for x in found.beside]
-    after = linear_left(model, seen, whole, found) if causes is None else causes.before[1]
-    return later_ends(whole, [len(r.y) for r in seen], before, after.left)
 
 
 def _experiment(

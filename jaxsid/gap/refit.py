@@ -79,15 +79,27 @@ class Bench(NamedTuple):
     guesses: tuple[Noise, ...]
     jump: float = np.inf
 
-    def state_deviations(self, slots: int) -> Float[np.ndarray, " m"]:
-        """Of all states at the start of a window; an effect's own is about as large as what moves there.
+    def state_deviations(self, effects: Sequence[Effect]) -> Float[np.ndarray, " m"]:
+        """Of all states at the start of a window; an effect's own is about as large as what moves, or is read, there.
 
         Args:
-            slots: of effects, each with a displacement and a velocity of its own.
+            effects: each with a displacement and a velocity of its own, or with what its signal was; one where there
+                is none.
         """
         size = len(self.still) // 2
-        own = np.repeat([self.still[:size].max(), self.still[size:].max()], slots)
-        return np.concatenate([self.still, own])
+        bodies = [self.still[:size].max(), self.still[size:].max()]
+        own = np.array([self._signal_deviation(e) or bodies for e in effects] or [bodies])
+        return np.concatenate([self.still, own.T.ravel()])
+
+    def _signal_deviation(self, effect: Effect) -> list[float]:
+        """Of the state of a late signal; nothing of what acts on bodies."""
+        ((where, name),) = effect.place
+        listed = {"input": self.model.inputs, "sensor": self.model.sensors}.get(where, ())
+        column = [x.name for x in listed].index(name) if listed else 0
+        of = [m.u if where == "input" else m.y for m in self.moved]
+        values = np.concatenate([x[:, column] for x in of])
+        level = float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
+        return [LARGE * max(level, np.finfo(float).tiny)] * 2 if listed else []
 
 
 class Hypothesis(NamedTuple):
@@ -400,7 +412,7 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
         ]
     )
     most = np.where(np.arange(len(deviation)) < len(elements), MOST_ELEMENT, MOST_UNKNOWN)
-    states = bench.state_deviations(shot.slots.count)
+    states = bench.state_deviations(hypothesis.effects)
     return Prior(deviation, np.zeros(len(deviation)), least, most, states, bench.jump * states / LARGE)
 
 
