@@ -2,6 +2,7 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ from gap_helpers import chain
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
 from jaxsid.gap import causes, explain
+from jaxsid.gap import look as look_of
 from jaxsid.gap import ranking as ranking_of
 from jaxsid.gap.causes import _Found, _otherwise
 from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
+from jaxsid.gap.look import Look
+from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import (
     LOUD,
     NUMBER,
@@ -171,6 +175,29 @@ def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypa
 
 def test_a_round_without_candidates_has_no_fits(tried):
     assert tried([], {}, 5) == ([], [])
+
+
+# what is tried next
+
+
+def test_laws_where_what_is_left_most_probably_arises_are_tried_early(monkeypatch):
+    """A colour of the noise that has taken what is left for noise lets forces of one frequency come first anywhere."""
+    elsewhere = [candidate(k, B12) for k in LAWS] + [candidate(k, B13) for k in LAWS]
+    here = [candidate("stribeck_friction", B23), candidate("missing_mode", {"body": "b2"})]
+    first = [candidate("cogging_ripple", B12)]
+    monkeypatch.setattr(causes, "candidates_of", lambda look: (*elsewhere, *here))
+    monkeypatch.setattr(look_of, "likeliest", lambda scored: Place("between", B23["between"]))
+    look = Look(*map(cast, [Any] * 3, ("fit", "null", "scored")))
+    found = causes._further_candidates(look, first)
+    assert {key_of(c.kind, c.place) for c in found} == {
+        key_of(c.kind, c.place) for c in (*elsewhere, *here, *first)
+    }
+    assert found[:4] == (elsewhere[0], here[0], elsewhere[1], first[0])
+    assert causes._further_candidates(look._replace(scored=None), first)[:3] == (
+        elsewhere[0],
+        elsewhere[1],
+        first[0],
+    )
 
 
 # where nothing more explains what is left

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored
-from jaxsid.gap.look import Look, candidates_of, looked, varied
+from jaxsid.gap.look import Look, at_likeliest, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, left_share
@@ -252,9 +253,10 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
 
 
 def _further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """What came next to the first effect, in turn with what now comes first."""
+    """What now comes first, in turn with what does where it most probably arises, and what came next to the first."""
     now = varied(candidates_of(look))
-    return tuple(c for three in zip(now[::2], now[1::2], varied(first), strict=False) for c in three)
+    streams = now[::2], at_likeliest(look, now), now[1::2], varied(first)
+    return tuple(c for four in zip_longest(*streams) for c in four if c is not None)
 
 
 def _elsewhere(

@@ -75,7 +75,7 @@ class Effort(NamedTuple):
 
 
 # with two effects a step costs several times as much
-FIRST, FURTHER = Effort(14, 4, 25, TEMPERATURE), Effort(15, 3, 16, TEMPERATURE)
+FIRST, FURTHER = Effort(14, 4, 25, TEMPERATURE), Effort(16, 3, 16, TEMPERATURE)
 NUMBERS = Effort(12, 6, 25, MILD)
 
 

@@ -144,6 +144,15 @@ def scored(
     return Scored(model, tuple(settings), noises, compared, tolerance, found)
 
 
+def likeliest(of: Scored) -> Place:
+    """The place whose evidence is largest.
+
+    Args:
+        of: from `scored`.
+    """
+    return of.places[int(_with_ties(of.found, of.places).argmax())]
+
+
 def located(of: Scored) -> Locations:
     """What the evidence of places says.
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from jaxsid.gap.deflate import deflated
 from jaxsid.gap.examine import NEGLIGIBLE
-from jaxsid.gap.locate import Scored, scored
+from jaxsid.gap.locate import Scored, likeliest, scored
 from jaxsid.gap.null import SIGNIFICANT, Null, null_test
 from jaxsid.gap.places import places_of
+from jaxsid.gap.ranking import ends_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import Bench, Refit
 from jaxsid.gap.screen import Candidate, screen
@@ -70,6 +71,19 @@ def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:
             chosen.append(i)
             seen = np.maximum(seen, present[i])
     return [i for i in range(len(lengths)) if lengths[i] in {lengths[j] for j in chosen}]
+
+
+def at_likeliest(look: Look, candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Those that act where what is left most probably arises.
+
+    Args:
+        look: tells where.
+        candidates: of it.
+    """
+    if look.scored is None:
+        return ()
+    place = ends_of(likeliest(look.scored).as_dict())
+    return tuple(c for c in candidates if ends_of(c.place) == place)
 
 
 def varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
