@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effects_truth import GROUND, Chain, Truth
+from scipy.integrate import solve_ivp
 
 import jaxsid
 from jaxsid.checks import InputError
@@ -349,3 +350,23 @@ def test_a_chaotic_motion_warns():
     wild = effect("end_stop", JOINT, {"stiffness": 2e6, "clearance": 1e-3})
     with pytest.warns(UserWarning, match="when steps are halved"):
         jaxsid.simulate(chain([wild]), record(drive()))
+
+
+@pytest.mark.parametrize(
+    ("beta", "gamma", "exponent", "saturates"),
+    [(60.0, 40.0, 1.0, True), (2e3, -1e3, 1.7, True), (10.0, 300.0, 1.2, True), (0.02, -35.0, 1.0, False)],
+)
+def test_a_loop_makes_sense_where_its_memory_saturates(beta, gamma, exponent, saturates):
+    """Along one stroke, scipy: either to (beta + gamma)^(-1/n), or without bound."""
+    kind = CATALOGUE["hysteresis"]
+    last = 3.0  # many times what saturates it
+    grown = lambda x, z: z[0] - 1e3  # noqa: E731
+    grown.terminal = True
+    rate = lambda x, z: [1 - (beta * np.sign(z[0]) + gamma) * abs(z[0]) ** exponent]  # noqa: E731
+    path = solve_ivp(rate, (0, last), [0.0], events=grown, rtol=1e-9, atol=1e-12)
+    if saturates:
+        np.testing.assert_allclose(path.y[0, -1], (beta + gamma) ** (-1 / exponent), rtol=1e-6)
+    else:
+        assert path.y[0, -1] > 100
+    assert kind.sensible(1.0, beta, gamma, exponent) == saturates
+    assert not kind.sensible(-1.0, beta, gamma, exponent)

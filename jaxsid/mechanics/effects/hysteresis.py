@@ -17,8 +17,8 @@ def _rate(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Arr
 
 
 def _sensible(stiffness: float, beta: float, gamma: float, exponent: float) -> bool:
-    # a loop that runs the other way round would feed the motion
-    return stiffness > 0
+    # a loop that runs the other way round would feed the motion, and a memory that never saturates grows without bound
+    return stiffness > 0 and beta + gamma > 0
 
 
 EFFECT = Kind(
@@ -32,7 +32,7 @@ EFFECT = Kind(
     ),
     law="F = a z, z' = v - beta abs(v) abs(z)^(n-1) z - gamma v abs(z)^n",
     about="Wire ropes, rubber, joints that slip a little: the force lags behind, as a loop of some width.",
-    source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976).",
+    source="Y. K. Wen, J. Eng. Mech. Div. ASCE 102 (1976); F. Ikhouane and J. Rodellar, Nonlinear Dyn. 42 (2005).",
     force=_force,
     restoring=True,
     rate=_rate,
