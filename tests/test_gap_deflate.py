@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 from gap_bench import bench, colored
-from gap_helpers import DT, JOINT, drive, exact, record
+from gap_helpers import DT, JOINT, SAMPLES, chain, drive, exact, record
 from gap_helpers import with_effect as truth
 
 from jaxsid.gap import deflate as module
 from jaxsid.gap.deflate import deflated
+from jaxsid.gap.null import null_test
+from jaxsid.gap.places import places_of
+from jaxsid.gap.recalibrate import recalibrated
 from jaxsid.gap.refit import Hypothesis, refitted
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
@@ -49,6 +52,23 @@ def test_what_effects_do_is_taken_out(effects, late_by, followed, monkeypatch):
     did = np.sqrt(((y - plain) ** 2).mean(axis=0))
     assert (np.sqrt((gone**2).mean(axis=0)) < np.maximum(0.02 * did, 0.5 * level)).all()
     assert (left.inputs, left.outputs) == (record(u, y).inputs, record(u, y).outputs)
+
+
+def test_what_a_late_input_was_before_the_record_is_no_finding():
+    """An accelerometer beside the drive reads it at once: at first what nobody recorded."""
+    begin, late_by = 200, 2.4 * DT
+    u = drive(SAMPLES + begin)
+    y = truth(u, "input_delay", 0, {"delay": late_by})[begin:]
+    for seed in range(3):
+        measured, level = colored(y, seed)
+        of = bench(measured, level, u=u[begin:])
+        found = refitted(of, Hypothesis((effect("input_delay", "drive", delay=2.2 * DT),)))
+        assert found.fit.squares < 1.1 * found.fit.equations
+        (delay,) = (float(x.parameters["delay"]) for x in found.hypothesis.effects)
+        assert abs(delay - late_by) < 4 * found.deviations[0]["delay"]
+        left = deflated([record(u[begin:], measured)], of, found)
+        fit = recalibrated(chain(), left, of.noises, wide=True, given=True)
+        assert null_test(fit, places_of(chain()), deflated=True).p_value > 0.01
 
 
 def test_nothing_is_taken_out_of_a_record_without_effects():

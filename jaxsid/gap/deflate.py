@@ -15,12 +15,13 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxsid.gap.free_run import free_run
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.refit import Bench, Refit, shot_of
 from jaxsid.gap.shooting import Products, Shot, products_of
+from jaxsid.gap.windows import Block, untold
 from jaxsid.mechanics.simulate import ordered_inputs
 from jaxsid.records import Record
 
@@ -36,16 +37,20 @@ def deflated(records: Sequence[Record], bench: Bench, found: Refit) -> list[Reco
     if not found.hypothesis.effects:
         return list(records)
     begun = found.fit.states if _followed(bench) else _run(records, bench, found)
-    changes = _changes(bench, found, begun)
+    first = [untold(len(r.y)) for r in records]
+    changes = _changes(bench, found, begun, first)
     if not all(np.isfinite(x).all() for x in changes):
-        changes = _changes(bench, found, found.fit.states)
+        changes = _changes(bench, found, found.fit.states, first)
     return [_less(record, i, bench, changes) for i, record in enumerate(records)]
 
 
 def _changes(
-    bench: Bench, found: Refit, begun: Sequence[Float[np.ndarray, "windows n"]]
+    bench: Bench, found: Refit, begun: Sequence[Float[np.ndarray, "windows n"]], first: Sequence[int]
 ) -> list[Float[np.ndarray, "windows length outputs"]]:
-    """What effects do to the readings of every window, whose states are given where it begins."""
+    """What effects do to the readings of every window, whose states are given where it begins.
+
+    Of each record the first sample that is judged is given, too.
+    """
     size = 2 * len(bench.model.bodies)
     plain, theta = _linear(found, bench)
     own = ((0, 0), (0, 2 * plain.slots.count))
@@ -54,7 +59,15 @@ def _changes(
     shares = _shares(bench, within, products_of(plain, bench.blocks, theta, states, 1), size)
     rest = [s - np.pad(c, own) for s, c in zip(states, shares, strict=True)]
     without = products_of(plain, bench.blocks, theta, rest, 1)
-    return [np.asarray(x.left) - np.asarray(y.left) for x, y in zip(within, without, strict=True)]
+    # samples that were not judged become what the linear model makes of them
+    parts = zip(bench.blocks, within, without, strict=True)
+    return [np.where(_told(b, first), x.left, 0.0) - np.asarray(y.left) for b, x, y in parts]
+
+
+def _told(block: Block, first: Sequence[int]) -> Bool[np.ndarray, "windows length 1"]:
+    """Which samples of its windows are no earlier than the first of its record that is judged."""
+    number = np.asarray(block.first)[:, None] + np.arange(block.y.shape[1])
+    return (number >= first[int(block.record[0])])[:, :, None]
 
 
 def _followed(bench: Bench) -> bool:

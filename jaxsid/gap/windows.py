@@ -20,6 +20,7 @@ BLOCKS = 1024, 2048  # samples that a block judges: the shortest that a record f
 SHORTEST, LONGEST = 128, 2048  # samples that a window judges
 PERIODS = 4.0  # of the slowest vibration, in a window
 LEAD = 8  # part of a window, as its inverse, that comes before what it judges
+UNTOLD, UNTOLD_PART = SHORTEST // LEAD, 0.02  # first samples of a record that are not judged, and most of it
 
 
 class Block(eqx.Module):
@@ -28,8 +29,8 @@ class Block(eqx.Module):
     Attributes:
         u: (windows, lead + lead + length, inputs) inputs, from one lead before the window begins.
         y: (windows, lead + length, outputs) measured.
-        weight: (windows, lead + length, outputs) one over the noise's level, 0 where nothing was measured; what comes
-            before the window serves the filter only.
+        weight: (windows, lead + length, outputs) one over the noise's level, 0 where nothing was measured, and of a
+            record's first samples; what comes before the window serves the filter only.
         taps: (windows, outputs, taps) of the filter that makes the noise white, the first 1.
         first: (windows,) number of the sample that a window begins at, less than 0 before the record's start.
         record: (windows,) number of the record.
@@ -62,6 +63,15 @@ def window_length(rate: float, dt: float, longest: int) -> int:
     wished = PERIODS * 2 * np.pi / rate / dt
     power = int(np.ceil(np.log2(max(min(wished, longest), 1.0))))
     return int(np.clip(2**power, SHORTEST, LONGEST))
+
+
+def untold(samples: int) -> int:
+    """How many of a record's first samples are not judged: a late input is still there what it was before.
+
+    Args:
+        samples: of the record.
+    """
+    return min(UNTOLD, round(UNTOLD_PART * samples))
 
 
 def blocks_of(
@@ -102,6 +112,8 @@ def _of_record(
     y[:, rows] = np.nan_to_num(np.asarray(record.y)[:, columns])
     seen = np.zeros_like(y)
     seen[:, rows] = np.isfinite(np.asarray(record.y)[:, columns])
+    if begin == 0:
+        seen[: untold(samples)] = 0.0
     level = np.where(np.isfinite(noise.level) & (noise.level > 0), noise.level, np.inf)
     windows = -(-(samples - begin) // (length * count)) * count
     after = begin + windows * length - samples
