@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsid.gap.closely import PARTED, closely, motions_to_begin, parting, tightened
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
@@ -31,7 +32,7 @@ from jaxsid.gap.look import Look, at_likeliest, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, left_share
-from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, notable, parsimonious
+from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, loud, notable, parsimonious
 from jaxsid.gap.refit import (
     Bench,
     Hypothesis,
@@ -57,6 +58,7 @@ LESS = 0.1  # part of what is left above the noise that a further effect must re
 LEAST = 0.01  # and of all that is left, or of a first effect MOSTLY what tests find
 MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
+CLOSELY = 6  # laws of the most probable place that are tried where none leaves little
 AGAIN = 6  # others that an effect is compared with when it is asked again, of each sort
 FAR = 4.0  # times what an effect left when it was found, that others which left more are not asked again
 
@@ -145,7 +147,9 @@ def causes_of(
         chosen, selected = linear, []
     say("how far the gap shrinks")
     ends = tuple(len(r.y) for r in seen)
-    lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=is_free_or_unstable(model))
+    motions = motions_to_begin(bench, whole, found.noises, found.scored)
+    windowed = is_free_or_unstable(model) or motions is not None
+    lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=windowed, motions=motions)
     frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
     before = lefts(refitted(frozen, Hypothesis())), lefts(linear)
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
@@ -154,7 +158,9 @@ def causes_of(
     told = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
     floor = tuple(map(no_louder, told, steps[-1].left))
     *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
-    if selected:
+    if motions is not None:
+        later = ends  # no run tells what comes later
+    elif selected:
         later = later_than_effects(chosen, bench, whole, ends, each[-1])
     else:
         later = later_than_linear(found, linear, bench, whole, ends, before[1])
@@ -212,6 +218,7 @@ class _Found(NamedTuple):
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
             bench, last = tied(bench, last, steps=POLISHED)
+        bench, last = tightened(bench, last)
         bench = bench._replace(states=last.fit.states)
         rounds = (*self.rounds[: len(self.selected)], ranking)
         return _Found(bench, self.look, rounds, (*self.selected, best._replace(refit=last)), last)
@@ -236,6 +243,8 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         if not candidates:
             break
         at = _further(at, candidates, effort, model, seen, say)
+        if not origin.selected and effort is FIRST and loud(at.rounds[-1]):
+            at, origin = _followed(origin, at.rounds[-1], candidates, model, seen, say) or (at, origin)
         if len(at.selected) == known == begun + 1 and not at.look.clear:
             at = _elsewhere(at, origin, first, model, seen, say)
             at = _otherwise(at, origin, first, model, seen, say)
@@ -250,6 +259,26 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
             break
         candidates = _further_candidates(at.look, first)
     return at
+
+
+def _followed(
+    origin: _Found,
+    usual: Ranking,
+    candidates: Sequence[Candidate],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> tuple[_Found, _Found] | None:
+    """The first effect in windows of a few samples, with it and without; None where usual ones do, or do better."""
+    look, here = origin.look, at_likeliest(origin.look, candidates)[:CLOSELY]
+    if look.scored is None or not here:
+        return None
+    say("in windows of a few samples")
+    begin = origin._replace(bench=closely(model, seen, origin.bench.guesses, look.fit, look.scored))
+    at = _further(begin, here, FIRST, model, seen, say)
+    if not at.selected or at.rounds[-1].density < usual.density:
+        return None
+    return (at, begin) if parting(at.bench, at.selected[-1].refit) > PARTED else None
 
 
 def _further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.gap.fit import Prior, fitted
+from jaxsid.gap.fit import STEPS, Prior, fitted
 from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import Bench, Refit
+from jaxsid.gap.refit import JUMP, Bench, Refit, noise_part
 from jaxsid.gap.resume import step
+from jaxsid.gap.setting import LARGE
 from jaxsid.gap.shooting import products_of
 from jaxsid.gap.windows import Block, blocks_of
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -85,7 +86,13 @@ def substantial(gap: float, floor: float) -> bool:
 
 @step
 def left_of(
-    found: Refit, bench: Bench, records: Sequence[Record], ends: Sequence[int], *, windowed: bool
+    found: Refit,
+    bench: Bench,
+    records: Sequence[Record],
+    ends: Sequence[int],
+    *,
+    windowed: bool,
+    motions: Sequence[Float[np.ndarray, "samples n"]] | None = None,
 ) -> Left:
     """What a fitted model leaves of held-out samples, running on from the last state that was fitted before them.
 
@@ -95,6 +102,8 @@ def left_of(
         records: whole.
         ends: samples of each that were seen.
         windowed: whether every window begins anew from the state that suits it, for models that drift away.
+        motions: of whole records, that windows of a few samples are searched from, each leading to the next as far as
+            noise lets it.
     """
     blocks = blocks_of(bench.model, records, bench.noises, _length(bench), ends)
     left, measured = [], []
@@ -105,7 +114,8 @@ def left_of(
         seen = np.concatenate([_judged(b, b.weight) for b in own])[:count] > 0
         run, start = _run_on(found, bench, record, number)
         if windowed:
-            states = _states(found, bench, own, run.states, start)
+            near = (run.states, start) if motions is None else (motions[number], 0)
+            states = _states(found, bench, own, *near)
             rest = np.concatenate(
                 [_judged(b, x) for b, x in zip(own, _left(found, bench, own, states), strict=True)]
             )
@@ -158,16 +168,19 @@ def _run_on(found: Refit, bench: Bench, record: Record, number: int) -> tuple[Ru
 
 
 def _states(
-    found: Refit, bench: Bench, blocks: Sequence[Block], run: np.ndarray, start: int
+    found: Refit, bench: Bench, blocks: Sequence[Block], motion: np.ndarray, start: int
 ) -> tuple[np.ndarray, ...]:
-    """Initial states of windows, all else as it is."""
-    theta = found.fit.theta
+    """Initial states of windows near a motion that is given from a sample on, all else as it is."""
+    theta, followed = found.fit.theta, np.isfinite(bench.loose)
     same = np.full(len(theta), FIXED)
     states = bench.state_deviations(found.hypothesis.effects)
     least, most = np.full(len(theta), -np.inf), np.ones(len(theta))
-    prior = Prior(same, theta, least, most, states, np.full(len(states), np.inf))
-    begin = [run[np.clip(np.asarray(b.first) - start, 0, len(run) - 1)] for b in blocks]
-    fit = fitted(found.shot, blocks, prior, theta, begin, substeps=bench.substeps, steps=ROUNDS)
+    jump = JUMP * noise_part(bench) * states / LARGE if followed else np.full(len(states), np.inf)
+    prior = Prior(same, theta, least, most, states, jump)
+    begin = [motion[np.clip(np.asarray(b.first) - start, 0, len(motion) - 1)] for b in blocks]
+    begin = [np.pad(x, ((0, 0), (0, len(states) - x.shape[1]))) for x in begin]
+    steps = STEPS if followed else ROUNDS
+    fit = fitted(found.shot, blocks, prior, theta, begin, substeps=bench.substeps, steps=steps)
     return fit.states
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxsid.checks import require
 from jaxsid.compilation import release_programs
 from jaxsid.gap.causes import Causes, causes_of
+from jaxsid.gap.closely import LENGTH, followed_closely
 from jaxsid.gap.closure import Closure
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.experiment import Experiment, experiment_between
@@ -305,7 +306,7 @@ def _experiment(
     if causes is None or verdict.name != "ambiguous" or is_free_or_unstable(model):
         return None
     for ranking, likely in zip(causes.rounds, verdict.likely, strict=False):
-        if len(likely) > 1:
+        if len(likely) > 1 and not followed_closely(ranking.bench):
             if progress is not None:
                 progress("what to measure next")
             return experiment_between(likely[0], likely[1], ranking.bench, records)
@@ -337,6 +338,13 @@ def _warnings(
     ]
     if verdict.name != "none" and (causes is None or not causes.selected):
         said += about_numbers(found)
+    if causes is not None and any(followed_closely(x.bench) for x in causes.rounds):
+        kind = causes.rounds[0].ranked[0].kind.replace("_", " ")
+        said.append(
+            f"Under the law of {kind} neighbouring motions part at once, so that no run follows a record for long. "
+            "What is said of held-out samples is said of motions that may be corrected every "
+            f"{LENGTH} samples, by about as much as noise hides."
+        )
     said += _about_sensors(model, found) + about_inputs(model, found)
     if any(n.source == SOURCES[-1] for n in found.noises):
         said.append(

@@ -204,7 +204,7 @@ def elsewhere(
     base = before.hypothesis if before is not None else Hypothesis()
     others = [c for c in _distinct(candidates, base, errors) if c.kind == best.kind]
     others = [c for c in others if key_of(c.kind, c.place) != best.key][:ELSEWHERE]
-    bench = ranking.bench._replace(jump=np.inf)
+    bench = ranking.bench._replace(jump=ranking.bench.loose)
 
     def thorough(c: Candidate) -> Whole:
         say(f"{c.kind} at {_label(c.place)}, thoroughly")
@@ -243,7 +243,7 @@ def plainer(
     if not loud(ranking):
         return ranking
     best, say = ranking.ranked[0], progress or (lambda text: None)
-    bench, whole = ranking.bench._replace(jump=np.inf), len(ranking.bench.blocks)
+    bench, whole = ranking.bench._replace(jump=ranking.bench.loose), len(ranking.bench.blocks)
     fewer = [
         y
         for y in ranking.ranked[1:]

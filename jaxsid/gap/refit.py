@@ -64,6 +64,7 @@ class Bench(NamedTuple):
         guesses: what they were to begin with.
         jump: of a state from where a window ends to where the next begins, next to how large states are; infinite where
             each stands alone.
+        loose: with which a search begins; finite only where windows are too short to stand alone, see `closely`.
     """
 
     model: LumpedModel
@@ -78,6 +79,7 @@ class Bench(NamedTuple):
     noises: tuple[Noise, ...]
     guesses: tuple[Noise, ...]
     jump: float = np.inf
+    loose: float = np.inf
 
     def state_deviations(self, effects: Sequence[Effect]) -> Float[np.ndarray, " m"]:
         """Of all states at the start of a window; an effect's own is about as large as what moves, or is read, there.
@@ -143,7 +145,12 @@ def changes_of(found: Refit, bench: Bench) -> Float[np.ndarray, " e"]:
 
 
 def bench_of(
-    model: LumpedModel, records: Sequence[Record], noises: Sequence[Noise], refit: Recalibrated
+    model: LumpedModel,
+    records: Sequence[Record],
+    noises: Sequence[Noise],
+    refit: Recalibrated,
+    *,
+    length: int | None = None,
 ) -> Bench:
     """Records ready for fits.
 
@@ -152,13 +159,15 @@ def bench_of(
         records: with some of its sensors each.
         noises: of each.
         refit: the best linear model beside the records.
+        length: samples that a window judges; a few periods of the slowest vibration where left out.
     """
     model = with_effects(model, ())
     dt = min(float(r.dt) for r in records)
     longest = max(len(r.y) for r in records)
     # small disturbing forces drive a free axis away from any long simulation
     free = free_bodies(model).shape[1] > 0
-    length = SHORTEST if free else window_length(slowest_rate(model), dt, longest)
+    usual = SHORTEST if free else window_length(slowest_rate(model), dt, longest)
+    length = usual if length is None else length
     blocks = blocks_of(model, records, noises, length)
     motions = [
         np.asarray(in_time(s.spectra, x.motion.states))
@@ -182,7 +191,7 @@ def bench_of(
     return Bench(
         model,
         blocks,
-        tuple(_states_at(b, motions[int(b.record[0])]) for b in blocks),
+        states_at(blocks, motions),
         tuple(moved),
         np.maximum(near, FIXED),
         far,
@@ -205,10 +214,14 @@ def _substeps(model: LumpedModel, dt: float) -> int:
 def weighed_anew(bench: Bench, found: Refit) -> Bench:
     """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
 
+    Windows of few samples take up part of the noise themselves and tell nothing of it.
+
     Args:
         bench: records.
         found: a fit to all of it.
     """
+    if np.isfinite(bench.loose):
+        return bench
     lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
     noises = list(bench.noises)
     for number, noise in enumerate(bench.noises):
@@ -222,7 +235,7 @@ def weighed_anew(bench: Bench, found: Refit) -> Bench:
 
 
 def as_guessed(bench: Bench) -> Bench:
-    """The bench with the noise as it was guessed to begin with, where nothing else tells of it, and windows apart.
+    """The bench with the noise as it was guessed to begin with, where nothing else tells of it, and windows loose.
 
     What a fit leaves may be more than noise; a search that begins there does not find what that is.
 
@@ -230,8 +243,8 @@ def as_guessed(bench: Bench) -> Bench:
         bench: records.
     """
     if all(n.degrees > 0 for n in bench.noises):
-        return bench
-    return _weighed(bench, bench.guesses)._replace(jump=np.inf)
+        return bench._replace(jump=bench.loose if np.isfinite(bench.loose) else bench.jump)
+    return _weighed(bench, bench.guesses)._replace(jump=bench.loose)
 
 
 def _seen(block: Block) -> Bool[np.ndarray, "windows length outputs"]:
@@ -249,6 +262,20 @@ def _weighed(bench: Bench, noises: Sequence[Noise]) -> Bench:
     return bench._replace(blocks=tuple(blocks), noises=tuple(noises))
 
 
+def noise_part(bench: Bench) -> float:
+    """How large the noise is next to the signals, geometric mean over sensors.
+
+    Args:
+        bench: records.
+    """
+    shown = np.concatenate(
+        [(np.asarray(b.y) * np.asarray(b.weight)).reshape(-1, b.y.shape[2]) for b in bench.blocks]
+    )
+    seen = (shown != 0).any(axis=0)
+    shown = np.where(shown != 0, shown, np.nan)[:, seen]
+    return float(1 / np.exp(np.log(np.nanstd(shown, axis=0)).mean()))
+
+
 def tied(bench: Bench, found: Refit, *, steps: int, gain: float = GAIN) -> tuple[Bench, Refit]:
     """Each window leading to the next, if the evidence of a fit is the larger for it; else both as they are.
 
@@ -263,13 +290,7 @@ def tied(bench: Bench, found: Refit, *, steps: int, gain: float = GAIN) -> tuple
     """
     if np.isfinite(bench.jump):
         return bench, found
-    shown = np.concatenate(
-        [(np.asarray(b.y) * np.asarray(b.weight)).reshape(-1, b.y.shape[2]) for b in bench.blocks]
-    )
-    seen = (shown != 0).any(axis=0)
-    shown = np.where(shown != 0, shown, np.nan)[:, seen]
-    level = 1 / np.exp(np.log(np.nanstd(shown, axis=0)).mean())
-    chained = bench._replace(jump=JUMP * level)
+    chained = bench._replace(jump=JUMP * noise_part(bench))
     begin = {"changes": changes_of(found, bench), "states": found.fit.states}
     new = refitted(chained, found.hypothesis, **begin, steps=steps, gain=gain)
     return (chained, new) if new.fit.evidence > found.fit.evidence else (bench, found)
@@ -344,9 +365,20 @@ def _with_own(states: np.ndarray, plain: int, slots: int) -> np.ndarray:
     return np.concatenate([states[:, :plain], own.reshape(len(states), -1)], axis=1)
 
 
-def _states_at(block: Block, motion: np.ndarray) -> np.ndarray:
-    at = np.asarray(block.first)
-    return np.where((at >= 0)[:, None], motion[np.clip(at, 0, len(motion) - 1)], 0.0)
+def states_at(
+    blocks: Sequence[Block], motions: Sequence[Float[np.ndarray, "samples n"]]
+) -> tuple[Float[np.ndarray, "windows n"], ...]:
+    """States where windows begin, zero before a record does.
+
+    Args:
+        blocks: of windows.
+        motions: displacements and velocities in every record.
+    """
+    found = []
+    for block in blocks:
+        motion, at = motions[int(block.record[0])], np.asarray(block.first)
+        found.append(np.where((at >= 0)[:, None], motion[np.clip(at, 0, len(motion) - 1)], 0.0))
+    return tuple(found)
 
 
 @step

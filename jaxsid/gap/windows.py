@@ -20,6 +20,7 @@ BLOCKS = 1024, 2048  # samples that a block judges: the shortest that a record f
 SHORTEST, LONGEST = 128, 2048  # samples that a window judges
 PERIODS = 4.0  # of the slowest vibration, in a window
 LEAD = 8  # part of a window, as its inverse, that comes before what it judges
+SHORTEST_LEAD = 2  # samples, where that would be less
 UNTOLD, UNTOLD_PART = SHORTEST // LEAD, 0.02  # first samples of a record that are not judged, and most of it
 
 
@@ -101,7 +102,7 @@ def blocks_of(
 def _of_record(
     model: LumpedModel, record: Record, noise: Noise, number: int, length: int, begin: int
 ) -> list[Block]:
-    lead = length // LEAD
+    lead = max(length // LEAD, SHORTEST_LEAD)
     whole = next((b for b in BLOCKS if len(record.y) - begin <= b), BLOCKS[-1])
     count = max(whole // length, 1)
     u, hold = ordered_inputs(model, record)

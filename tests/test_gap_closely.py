@@ -1,0 +1,160 @@
+"""Windows of a few samples for laws under which neighbouring motions part at once: snaps from well to well."""
+
+import math
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from gap_helpers import DT, JOINT, chain, drive, noisy, record, with_effect
+from scipy.linalg import expm
+from test_gap_causes import B12, BENCH, candidate, ranking, refit
+
+from jaxsid.gap import causes
+from jaxsid.gap.causes import _followed, _Found
+from jaxsid.gap.closely import LENGTH, PARTED, closely, implied, motions_to_begin, parting, tightened
+from jaxsid.gap.closure import left_of
+from jaxsid.gap.examine import examine
+from jaxsid.gap.look import Look
+from jaxsid.gap.refit import (
+    Hypothesis,
+    as_guessed,
+    bench_of,
+    refitted,
+    tied,
+    weighed_anew,
+)
+from jaxsid.gap.windows import SHORTEST
+from jaxsid.mechanics.lumped import Effect, second_order
+
+# its steepest slope is twice the joint's stiffness, so that there are several wells
+TRUE = {"amplitude": 12.0, "wavenumber": 250.0, "phase": 0.4}
+OFF = {"amplitude": 9.0, "wavenumber": 256.0, "phase": 0.6}
+SEEN = 896  # samples of the record
+
+
+def hypothesis(parameters):
+    return Hypothesis((Effect("cogging_ripple", (("between", ("b1", "b2")),), parameters),))
+
+
+@pytest.fixture(scope="module")
+def snaps():
+    """A record of snaps, its examination without the last samples, and both benches."""
+    u = drive()
+    y = noisy(with_effect(u, "cogging_ripple", JOINT, TRUE), 0.01)
+    whole, seen = record(u, y), record(u[:SEEN], y[:SEEN])
+    found = examine(chain(), seen)
+    usual = bench_of(chain(), [seen], found.noises, found.fit)
+    return whole, found, usual, closely(chain(), [seen], found.noises, found.fit, found.scored)
+
+
+@pytest.fixture(scope="module")
+def fitted(snaps):
+    return refitted(snaps[3], hypothesis(OFF), steps=60)
+
+
+def test_windows_are_short_and_lead_to_one_another(snaps):
+    _, found, _, bench = snaps
+    assert all(b.y.shape[1] - b.lead == LENGTH and b.lead > 0 for b in bench.blocks)
+    assert np.isfinite(bench.jump)
+    assert bench.jump == bench.loose
+    # the noise is white, as loud as it was with its colour
+    assert all(n.taps.shape[1] == 1 for n in bench.noises)
+    np.testing.assert_allclose(bench.noises[0].level, found.noises[0].rms())
+    # from the motion that a force at the most probable place implies
+    (motion,) = implied(found.scored)
+    for block, states in zip(bench.blocks, bench.states, strict=True):
+        first = np.asarray(block.first)
+        there = (first >= 0) & (first < SEEN)
+        np.testing.assert_array_equal(states[there], motion[first[there]])
+
+
+def test_a_law_with_several_wells_is_found_where_usual_windows_are_too_long(snaps, fitted):
+    _, _, usual, bench = snaps
+    (effect,) = fitted.hypothesis.effects
+    for name, value in TRUE.items():
+        np.testing.assert_allclose(effect.parameters[name], value, rtol=0.03)
+    assert fitted.fit.squares < 1.2 * fitted.fit.equations
+    long = refitted(usual, hypothesis(OFF), steps=60)
+    assert long.fit.squares > 20 * long.fit.equations
+    assert parting(bench, fitted) > PARTED
+    assert parting(bench, refitted(bench, Hypothesis(), steps=5)) < PARTED / 2
+
+
+def test_how_far_linear_motions_part_has_a_closed_form(snaps):
+    _, _, usual, bench = snaps
+    for of in (bench, usual):
+        found = refitted(of, Hypothesis(), steps=3)
+        unit = of.state_deviations(())[:6]
+        plain = second_order(found.model)
+        M, D, K = (np.asarray(x) for x in (plain.mass, plain.damping, plain.stiffness))
+        A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
+        block = of.blocks[0]
+        judged = block.y.shape[1] - block.lead
+        # a window runs from its lead on to where the next one begins
+        ends = judged * np.arange(1, max(SHORTEST // judged, 1) + 1)
+        paths = [expm(A * DT * samples) * unit / unit[:, None] for samples in ends]
+        most = max(math.log(np.linalg.norm(path, 2)) for path in paths)
+        np.testing.assert_allclose(parting(of, found), max(most, 0.0), atol=1e-6)
+
+
+def test_what_is_guessed_of_the_noise_stays(snaps, fitted):
+    bench = snaps[3]
+    assert weighed_anew(bench, fitted) is bench
+    assert tied(bench, fitted, steps=5) == (bench, fitted)
+    assert as_guessed(bench._replace(jump=0.0)).jump == bench.loose
+
+
+def test_play_goes_where_the_law_is_right(snaps, fitted):
+    _, _, usual, bench = snaps
+    tight, found = tightened(bench, fitted)
+    assert tight.jump < bench.jump / 10
+    assert found.fit.evidence > fitted.fit.evidence
+    assert as_guessed(tight).jump == bench.loose
+    wrong = refitted(bench, Hypothesis(), steps=10)
+    assert tightened(bench, wrong) == (bench, wrong)
+    plain = refitted(usual, Hypothesis(), steps=3)
+    assert tightened(usual, plain) == (usual, plain)
+
+
+def test_held_out_samples_are_followed_as_closely(snaps, fitted):
+    whole, found, usual, bench = snaps
+    assert motions_to_begin(usual, [whole], found.noises, found.scored) is None
+    motions = motions_to_begin(bench, [whole], found.noises, found.scored)
+    left = {}
+    for name, of in (("law", fitted), ("linear", refitted(bench, Hypothesis(), steps=10))):
+        (rest,) = left_of(of, bench, [whole], [SEEN], windowed=True, motions=motions).left
+        assert rest.shape == (len(whole.y) - SEEN, 3)
+        left[name] = np.sqrt((rest**2).mean(axis=0)) / bench.noises[0].level
+    assert (left["law"] < 2).all()
+    assert (left["linear"] > 5 * left["law"]).all()
+
+
+@pytest.mark.parametrize(
+    ("selected", "parts", "better", "taken"),
+    [
+        (1, True, True, True),
+        (1, False, True, False),  # usual windows do for the law
+        (1, True, False, False),  # they explain more
+        (0, True, True, False),  # nothing is worth it
+    ],
+)
+def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, better, taken):
+    look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
+    origin = _Found(BENCH, look, (), (), None)
+    law = ranking(0.0, kinds=[("cogging_ripple", B12)])
+    at = origin._replace(rounds=(law,), selected=law.ranked[:selected], before=refit(0.0))
+    tried = []
+    monkeypatch.setattr(causes, "at_likeliest", lambda look, candidates: tuple(candidates))
+    monkeypatch.setattr(causes, "closely", lambda *_: BENCH._replace(loose=0.1))
+    monkeypatch.setattr(causes, "_further", lambda begin, here, *_: tried.extend(here) or at)
+    monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
+    candidates = [candidate("cogging_ripple", B12)] * 9
+    usual = ranking(-100.0 if better else 100.0, kinds=[("periodic_disturbance", {"body": "b1"})])
+    silent = lambda text: None  # noqa: E731
+    usual = ranking(-100.0 if better else 100.0, kinds=[("periodic_disturbance", {"body": "b1"})])
+    silent = lambda text: None  # noqa: E731
+    found = _followed(origin, usual, candidates, BENCH.model, (), silent)
+    assert len(tried) == causes.CLOSELY
+    assert found == ((at, origin._replace(bench=BENCH._replace(loose=0.1))) if taken else None)
+    nowhere = origin._replace(look=look._replace(scored=None))
+    assert _followed(nowhere, usual, candidates, BENCH.model, (), silent) is None
