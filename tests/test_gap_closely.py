@@ -15,6 +15,7 @@ from jaxsid.gap.closely import LENGTH, PARTED, closely, implied, motions_to_begi
 from jaxsid.gap.closure import left_of
 from jaxsid.gap.examine import examine
 from jaxsid.gap.look import Look
+from jaxsid.gap.places import Place
 from jaxsid.gap.refit import (
     Hypothesis,
     as_guessed,
@@ -145,6 +146,8 @@ def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, better,
     at = origin._replace(rounds=(law,), selected=law.ranked[:selected], before=refit(0.0))
     tried = []
     monkeypatch.setattr(causes, "at_likeliest", lambda look, candidates: tuple(candidates))
+    place = [Place("between", ("b1", "b2"))]
+    monkeypatch.setattr(causes, "likeliest", lambda scored: place[-1])
     monkeypatch.setattr(causes, "closely", lambda *_: BENCH._replace(loose=0.1))
     monkeypatch.setattr(causes, "_further", lambda begin, here, *_: tried.extend(here) or at)
     monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
@@ -158,3 +161,5 @@ def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, better,
     assert found == ((at, origin._replace(bench=BENCH._replace(loose=0.1))) if taken else None)
     nowhere = origin._replace(look=look._replace(scored=None))
     assert _followed(nowhere, usual, candidates, BENCH.model, (), silent) is None
+    place.append(Place("input", ("drive",)))
+    assert _followed(origin, usual, candidates, BENCH.model, (), silent) is None

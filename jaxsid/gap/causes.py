@@ -27,7 +27,7 @@ from jaxsid.gap.explain import (
 )
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
-from jaxsid.gap.locate import Scored
+from jaxsid.gap.locate import Scored, likeliest
 from jaxsid.gap.look import Look, at_likeliest, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
@@ -271,7 +271,7 @@ def _followed(
 ) -> tuple[_Found, _Found] | None:
     """The first effect in windows of a few samples, with it and without; None where usual ones do, or do better."""
     look, here = origin.look, at_likeliest(origin.look, candidates)[:CLOSELY]
-    if look.scored is None or not here:
+    if look.scored is None or not here or "between" not in likeliest(look.scored).as_dict():
         return None
     say("in windows of a few samples")
     begin = origin._replace(bench=closely(model, seen, origin.bench.guesses, look.fit, look.scored))
