@@ -131,18 +131,19 @@ def test_held_out_samples_are_followed_as_closely(snaps, fitted):
 
 
 @pytest.mark.parametrize(
-    ("selected", "parts", "better", "taken"),
+    ("selected", "parts", "left", "taken"),
     [
-        (1, True, True, True),
-        (1, False, True, False),  # usual windows do for the law
-        (1, True, False, False),  # they explain more
-        (0, True, True, False),  # nothing is worth it
+        (1, True, 1.5, True),
+        (1, False, 1.5, False),  # usual windows do for the law
+        (1, True, 2.5, False),  # too much is left
+        (0, True, 1.5, False),  # nothing is worth it
     ],
 )
-def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, better, taken):
+def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, left, taken):
     look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
     origin = _Found(BENCH, look, (), (), None)
     law = ranking(0.0, kinds=[("cogging_ripple", B12)])
+    law = law._replace(ranked=(law.ranked[0]._replace(left=left),))
     at = origin._replace(rounds=(law,), selected=law.ranked[:selected], before=refit(0.0))
     tried = []
     monkeypatch.setattr(causes, "at_likeliest", lambda look, candidates: tuple(candidates))
@@ -152,14 +153,11 @@ def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, better,
     monkeypatch.setattr(causes, "_further", lambda begin, here, *_: tried.extend(here) or at)
     monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
-    usual = ranking(-100.0 if better else 100.0, kinds=[("periodic_disturbance", {"body": "b1"})])
     silent = lambda text: None  # noqa: E731
-    usual = ranking(-100.0 if better else 100.0, kinds=[("periodic_disturbance", {"body": "b1"})])
-    silent = lambda text: None  # noqa: E731
-    found = _followed(origin, usual, candidates, BENCH.model, (), silent)
+    found = _followed(origin, candidates, BENCH.model, (), silent)
     assert len(tried) == causes.CLOSELY
     assert found == ((at, origin._replace(bench=BENCH._replace(loose=0.1))) if taken else None)
     nowhere = origin._replace(look=look._replace(scored=None))
-    assert _followed(nowhere, usual, candidates, BENCH.model, (), silent) is None
+    assert _followed(nowhere, candidates, BENCH.model, (), silent) is None
     place.append(Place("input", ("drive",)))
-    assert _followed(origin, usual, candidates, BENCH.model, (), silent) is None
+    assert _followed(origin, candidates, BENCH.model, (), silent) is None

@@ -244,7 +244,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
             break
         at = _further(at, candidates, effort, model, seen, say)
         if not origin.selected and effort is FIRST and loud(at.rounds[-1]):
-            at, origin = _followed(origin, at.rounds[-1], candidates, model, seen, say) or (at, origin)
+            at, origin = _followed(origin, candidates, model, seen, say) or (at, origin)
         if len(at.selected) == known == begun + 1 and not at.look.clear:
             at = _elsewhere(at, origin, first, model, seen, say)
             at = _otherwise(at, origin, first, model, seen, say)
@@ -263,20 +263,19 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
 
 def _followed(
     origin: _Found,
-    usual: Ranking,
     candidates: Sequence[Candidate],
     model: LumpedModel,
     seen: Sequence[Record],
     say: Callable[[str], None],
 ) -> tuple[_Found, _Found] | None:
-    """The first effect in windows of a few samples, with it and without; None where usual ones do, or do better."""
+    """The first effect in windows of a few samples, with it and without; None where usual ones do, or none explains."""
     look, here = origin.look, at_likeliest(origin.look, candidates)[:CLOSELY]
     if look.scored is None or not here or "between" not in likeliest(look.scored).as_dict():
         return None
     say("in windows of a few samples")
     begin = origin._replace(bench=closely(model, seen, origin.bench.guesses, look.fit, look.scored))
     at = _further(begin, here, FIRST, model, seen, say)
-    if not at.selected or at.rounds[-1].density < usual.density:
+    if not at.selected or loud(at.rounds[-1]):
         return None
     return (at, begin) if parting(at.bench, at.selected[-1].refit) > PARTED else None
 

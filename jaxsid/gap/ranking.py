@@ -61,11 +61,6 @@ class Ranking(NamedTuple):
     bench: Bench
 
     @property
-    def density(self) -> float:
-        """Of the records with the best one, whatever the noise, its logarithm; none where there is none."""
-        return self.ranked[0].evidence + volume(self.bench) if self.ranked else -math.inf
-
-    @property
     def gain(self) -> float:
         """Tempered evidence of the best one over that of none of them; 0 where there is none."""
         if not self.ranked:
