@@ -198,6 +198,8 @@ def test_laws_where_what_is_left_most_probably_arises_are_tried_early(monkeypatc
         elsewhere[1],
         first[0],
     )
+    monkeypatch.setattr(causes, "candidates_of", lambda look: ())
+    assert causes._further_candidates(look, first) == ()
 
 
 # where nothing more explains what is left

@@ -243,7 +243,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         if not candidates:
             break
         at = _further(at, candidates, effort, model, seen, say)
-        if not origin.selected and effort is FIRST and loud(at.rounds[-1]):
+        if not origin.selected and effort is FIRST and not at.look.clear and loud(at.rounds[-1]):
             at, origin = _followed(origin, candidates, model, seen, say) or (at, origin)
         if len(at.selected) == known == begun + 1 and not at.look.clear:
             at = _elsewhere(at, origin, first, model, seen, say)
@@ -281,9 +281,12 @@ def _followed(
 
 
 def _further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """What now comes first, in turn with what does where it most probably arises, and what came next to the first."""
+    """What now comes first, in turn with what does where it most probably arises, and what came next to the first.
+
+    Nothing where nothing is left.
+    """
     now = varied(candidates_of(look))
-    streams = now[::2], at_likeliest(look, now), now[1::2], varied(first)
+    streams = (now[::2], at_likeliest(look, now), now[1::2], varied(first)) if now else ()
     return tuple(c for four in zip_longest(*streams) for c in four if c is not None)
 
 

@@ -243,7 +243,7 @@ def as_guessed(bench: Bench) -> Bench:
         bench: records.
     """
     if all(n.degrees > 0 for n in bench.noises):
-        return bench._replace(jump=bench.loose if np.isfinite(bench.loose) else bench.jump)
+        return bench._replace(jump=bench.loose) if np.isfinite(bench.loose) else bench
     return _weighed(bench, bench.guesses)._replace(jump=bench.loose)
 
 
