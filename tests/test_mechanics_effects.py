@@ -286,6 +286,20 @@ def test_one_program_for_all_kinds_over_a_batch():
     assert len(traces) == 1
 
 
+@pytest.mark.parametrize("number", [0, 6, 11, 24, 31])
+def test_one_and_two_steps_side_by_side_are_those_one_after_the_other(number):
+    from jaxsid.mechanics.nonlinear import respond, respond_twice, state_count
+    from jaxsid.mechanics.slots import slots_of
+
+    kind, place, parameters = CASES[number][:3]
+    slots, u = slots_of(chain([effect(kind, place, parameters)])), jnp.asarray(drive(300))[:, None]
+    given = (second_order(chain()), slots, u, jnp.array([False]), jnp.asarray(DT))
+    moving = jnp.asarray(np.random.default_rng(3).normal(size=state_count(3, 1))) * 1e-3
+    for substeps, found in enumerate(respond_twice(*given, moving), start=1):
+        for x, y in zip(found, respond(*given, moving, substeps), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.abs(np.asarray(y)).max())
+
+
 def test_single_precision():
     u = drive(400)
     model = chain([effect("coulomb_friction", JOINT, {"force": 2.0})])

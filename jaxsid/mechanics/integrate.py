@@ -45,6 +45,7 @@ class Step(eqx.Module):
         middle, carried: (3 slots, ports) what forces of the first half do to what is seen in the middle, at the end.
         weights: (n, 3 ports) of the forces at the start, of the two in the middle together, at the end.
         rubs: (n, slots) what a mean force does to the state.
+        give: (slots, slots) what a unit of each mean force takes off each speed.
     """
 
     linear: Array
@@ -52,6 +53,7 @@ class Step(eqx.Module):
     carried: Array
     weights: Array
     rubs: Array
+    give: Array
 
 
 def phi_columns(A: Array, columns: Array, h: Array) -> tuple[Array, Array, Array, Array]:
@@ -107,6 +109,7 @@ def step_of(system: Augmented, moved: tuple[Array, Array, Array, Array]) -> Step
         carried=seen @ half @ first_half,
         weights=jnp.concatenate([G1 - 3 * G2 + 4 * G3, 2 * G2 - 4 * G3, 4 * G3 - G2], axis=1),
         rubs=G1[:, :slots],
+        give=-seen[slots : 2 * slots] @ G1[:, :slots],
     )
 
 
@@ -146,54 +149,117 @@ def integrate(
     """
     h = dt / substeps
     step = step_of(system, moved_by(system, jnp.stack([h, h / 2])))
-    n, count = len(system.A), slots.count
-    ports = 2 * count
-    speeds = system.seen[count : 2 * count]
-    rubs, give = step.rubs, -speeds @ step.rubs
-    law = partial(_ports, slots, system.spring)
-    pushed = any(kind.force is not None for kind in possible(slots.kinds))
-
-    def advance(i: Array, carry: tuple, of_sample: Late, number: Array) -> tuple:
-        x, sliding, total = carry
-        value, change = line_over_step(of_sample, i / substeps, 1 / jnp.asarray(substeps, x.dtype))
-        time = dt * (number + i / substeps)
-        free = _apply(step.linear, jnp.concatenate([x, value, change]))
-        ahead, w0, wm, w1 = jnp.split(free, [n, n + 3 * count, n + 6 * count])
-        x1, mean = ahead, jnp.zeros_like(total)
-        if pushed:
-            f0 = law(w0, time)
-            fa = law(wm + _apply(step.middle, f0), time + h / 2)
-            fb = law(wm + _apply(step.middle, fa), time + h / 2)
-            late_half = _apply(step.middle, 2 * fb - f0)
-            f1 = law(w1 + _apply(step.carried, f0) + late_half, time + h)
-            x1 = x1 + _apply(step.weights, jnp.concatenate([f0, fa + fb, f1]))
-            mean = (f0 + 2 * (fa + fb) + f1) / 6
-        if acting(slots.kinds):
-            before, free = w0[count : 2 * count], _apply(speeds, x1)
-            force, sliding = friction(slots.kinds, slots.parameters, before, sliding, free, give)
-            x1, mean = x1 + _apply(rubs, force), mean.at[:count].add(force)
-        return x1, sliding, total + mean / substeps
-
-    # one row a sample goes in, one comes out: each access costs as much as the arithmetic
-    inputs = late.new.shape[1]
-    arrival = jnp.broadcast_to(late.arrival, late.new.shape)
-    numbers = first + jnp.arange(len(late.new), dtype=state.dtype)
-    rows = jnp.concatenate([*late[:4], arrival, numbers[:, None]], axis=1)
 
     def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
         x, sliding = carry
-        of_sample = Late(*row[:-1].reshape(5, inputs))
-        one = partial(advance, of_sample=of_sample, number=row[-1])
-        begin = (x, sliding, jnp.zeros(ports, x.dtype))
-        x1, after, mean = lax.fori_loop(0, substeps, lambda i, c: one(i, c), begin)
+
+        def one(i: Array, carry: _Carry) -> _Carry:
+            return _advance(
+                system, slots, step, dt, row, (i / substeps, 1 / jnp.asarray(substeps, x.dtype)), carry
+            )
+
+        begin = _Carry(x, sliding, jnp.zeros(2 * slots.count, x.dtype))
+        x1, after, mean = lax.fori_loop(0, substeps, one, begin)
         return (x1, after), jnp.concatenate([x, sliding, mean])
 
-    _, found = lax.scan(sample, (state, _sliding_at(speeds, state)), rows)
-    return Path(*jnp.split(found, [n, n + count], axis=1))
+    _, found = lax.scan(sample, (state, _sliding_at(system, slots, state)), _rows(late, first, state))
+    return _path(found, system, slots)
 
 
-def _sliding_at(speeds: Array, state: Array) -> Array:
+def integrate_twice(
+    system: Augmented, slots: Slots, late: Late, dt: Array, state: Float[Array, " n"]
+) -> tuple[Path, Path]:
+    """The motions of `integrate` with one step and with two for each sample, in the time of two.
+
+    The one step is taken beside the second of the two: what a loop costs is its turns, not its arithmetic.
+
+    Args:
+        system: linear part and ports.
+        slots: the effects.
+        late: the inputs between samples.
+        dt: sampling interval, s.
+        state: to begin with.
+    """
+    begins, lengths = jnp.asarray([0.0, 0.5], state.dtype), jnp.asarray([1.0, 0.5], state.dtype)
+    steps = jax.vmap(lambda h: step_of(system, moved_by(system, jnp.stack([h, h / 2]))))(lengths * dt)
+    half = jax.tree.map(lambda x: x[1], steps)
+
+    def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
+        x, sliding = carry
+        still = jnp.zeros((2, 2 * slots.count), x.dtype)
+        one, two = (_Carry(x[i], sliding[i], still[i]) for i in range(2))
+        two = _advance(system, slots, half, dt, row, (begins[0], lengths[1]), two)
+
+        def last(step: Step, begin: Array, length: Array, carry: _Carry) -> _Carry:
+            return _advance(system, slots, step, dt, row, (begin, length), carry)
+
+        both = jax.tree.map(lambda *x: jnp.stack(x), one, two)
+        x1, after, mean = jax.vmap(last)(steps, begins, lengths, both)
+        return (x1, after), jnp.concatenate([x, sliding, mean], axis=1)
+
+    begin = (jnp.stack([x, x]) for x in (state, _sliding_at(system, slots, state)))
+    _, found = lax.scan(sample, tuple(begin), _rows(late, 0, state))
+    return _path(found[:, 0], system, slots), _path(found[:, 1], system, slots)
+
+
+class _Carry(NamedTuple):
+    """State, which way each place slides, and sum so far of the ports' mean forces."""
+
+    x: Array
+    sliding: Array
+    total: Array
+
+
+def _advance(
+    system: Augmented,
+    slots: Slots,
+    step: Step,
+    dt: Array,
+    row: Array,
+    part: tuple[Array, Array],
+    carry: _Carry,
+) -> _Carry:
+    """One step, which begins and lasts the two given parts of the sample of a row."""
+    x, sliding, total = carry
+    begin, length = part
+    n, count, inputs = len(system.A), slots.count, system.B.shape[1]
+    speeds, h = system.seen[count : 2 * count], length * dt
+    value, change = line_over_step(Late(*row[:-1].reshape(5, inputs)), begin, length)
+    time = dt * (row[-1] + begin)
+    free = _apply(step.linear, jnp.concatenate([x, value, change]))
+    ahead, w0, wm, w1 = jnp.split(free, [n, n + 3 * count, n + 6 * count])
+    law = partial(_ports, slots, system.spring)
+    x1, mean = ahead, jnp.zeros_like(total)
+    if any(kind.force is not None for kind in possible(slots.kinds)):
+        f0 = law(w0, time)
+        fa = law(wm + _apply(step.middle, f0), time + h / 2)
+        fb = law(wm + _apply(step.middle, fa), time + h / 2)
+        late_half = _apply(step.middle, 2 * fb - f0)
+        f1 = law(w1 + _apply(step.carried, f0) + late_half, time + h)
+        x1 = x1 + _apply(step.weights, jnp.concatenate([f0, fa + fb, f1]))
+        mean = (f0 + 2 * (fa + fb) + f1) / 6
+    if acting(slots.kinds):
+        before, free = w0[count : 2 * count], _apply(speeds, x1)
+        force, sliding = friction(slots.kinds, slots.parameters, before, sliding, free, step.give)
+        x1, mean = x1 + _apply(step.rubs, force), mean.at[:count].add(force)
+    return _Carry(x1, sliding, total + mean * length)
+
+
+def _rows(late: Late, first: int | Array, state: Array) -> Array:
+    """One row a sample goes in, one comes out: each access costs as much as the arithmetic."""
+    arrival = jnp.broadcast_to(late.arrival, late.new.shape)
+    numbers = first + jnp.arange(len(late.new), dtype=state.dtype)
+    return jnp.concatenate([*late[:4], arrival, numbers[:, None]], axis=1)
+
+
+def _path(found: Array, system: Augmented, slots: Slots) -> Path:
+    n = len(system.A)
+    return Path(*jnp.split(found, [n, n + slots.count], axis=1))
+
+
+def _sliding_at(system: Augmented, slots: Slots, state: Array) -> Array:
     """Which way each place slides at first; a speed that is nothing but rounding is rest."""
+    speeds = system.seen[slots.count : 2 * slots.count]
     size = 1e-12 * jnp.abs(speeds) @ jnp.abs(state)
     relative = speeds @ state
     return jnp.where(jnp.abs(relative) > size, jnp.sign(relative), 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsid.mechanics.augmented import Augmented, augmented
 from jaxsid.mechanics.effects.catalogue import possible
 from jaxsid.mechanics.held_input import Late, late_input, line_over_step, value_at_sample
-from jaxsid.mechanics.integrate import Path, instant_forces, integrate, phi_columns
+from jaxsid.mechanics.integrate import Path, instant_forces, integrate, integrate_twice, phi_columns
 from jaxsid.mechanics.slots import Slots
 from jaxsid.records import SecondOrderModel
 
@@ -131,8 +131,41 @@ def respond_to(
         substeps: steps for each sampling interval.
         first: number of the first sample in the record, for laws that depend on time.
     """
+    return _readings(
+        system, slots, late, dt, integrate(system, slots, late, dt, state, substeps, first), first
+    )
+
+
+def respond_twice(
+    linear: SecondOrderModel,
+    slots: Slots,
+    u: Float[Array, "samples inputs"],
+    ramps: Bool[Array, " inputs"],
+    dt: Float[Array, ""],
+    state: Float[Array, " n"],
+) -> tuple[Response, Response]:
+    """As `respond` with one step for each sampling interval, and with two, in the time of two.
+
+    Args:
+        linear: the model without effects.
+        slots: its effects.
+        u: inputs.
+        ramps: which are held to first order, the others to zero order.
+        dt: sampling interval, s.
+        state: at the first sample, as in `Response`.
+    """
+    system = augmented(linear, slots)
+    late = forced(system, slots, u, ramps, dt)
+    one, two = (
+        _readings(system, slots, late, dt, x) for x in integrate_twice(system, slots, late, dt, state)
+    )
+    return one, two
+
+
+def _readings(
+    system: Augmented, slots: Slots, late: Late, dt: Array, path: Path, first: int | Array = 0
+) -> Response:
     change = system.changed
-    path = integrate(system, slots, late, dt, state, substeps, first)
     forces = instant_forces(system, slots, path, value_at_sample(late), dt, first)
     if not any(kind.where == "sensor" for kind in possible(slots.kinds)):
         outputs = path.states @ system.C.T + value_at_sample(late) @ system.D.T + forces @ system.F.T

@@ -231,13 +231,13 @@ def simulate(
     require(bool(model.sensors and model.inputs), f"{model.name}: simulation needs an input and a sensor.")
     record = _as_record(model, record, dt)
     u, hold = ordered_inputs(model, record)
-    linear = physical_displacement_velocity(second_order(model))
     if model.effects:
         given = driven(model, u, hold, record.dt, number)
         state = jnp.zeros(given.states, given.u.dtype)
         if initial == "estimate":
-            state = _state_with_effects(given, linear, model, record, u, hold, substeps)
+            state = _state_with_effects(given, model, record, u, hold, substeps)
         return _said(run_driven(given, state, substeps), model)
+    linear = physical_displacement_velocity(second_order(model))
     if initial == "rest":
         return simulate_linear(linear, u, record.dt, hold=hold)
     return _from_estimate(linear, model, record, u, hold)
@@ -320,7 +320,6 @@ def measured_sensors(model: LumpedModel, record: Record) -> tuple[np.ndarray, np
 
 def _state_with_effects(
     given: Driven,
-    linear: ContinuousModel,
     model: LumpedModel,
     record: Record,
     u: Array,
@@ -329,6 +328,7 @@ def _state_with_effects(
 ) -> Array:
     """The initial state that fits a record, from that of the linear part; the effects' own states with it."""
     rows, measured = measured_sensors(model, record)
+    linear = physical_displacement_velocity(given.linear)
     free = discretise(linear, record.dt)
     y = record.y[:, measured]
     start = _fit_state(
