@@ -71,6 +71,17 @@ def test_a_guess_is_no_more_than_what_is_left():
     np.testing.assert_array_equal(quieter(measured, left).level, guess.level)
 
 
+def test_a_guess_is_no_less_than_what_tests_do_not_find():
+    """Where they find 19 % of the power, the rest is 0.9 of what is left; the guess stands where it lies between."""
+    taps = np.tile([1.0, -0.6], (3, 1))  # rms level / 0.8
+    guess = Noise(np.array([0.1, 0.95, 8.0]), np.tile([1.0, 0.0], (3, 1)), 0.0, "residual")
+    left = Noise(np.array([0.8, 0.8, 0.8]), taps, 0.0, "residual")
+    found = quieter(guess, left, 0.19)
+    np.testing.assert_allclose(found.rms(), [0.9, 0.95, 1.0], rtol=1e-3)
+    np.testing.assert_array_equal(found.taps[:, 1], [-0.6, 0.0, -0.6])
+    np.testing.assert_allclose(quieter(guess, left, 2.0).rms(), [0.1, 0.95, 1.0], rtol=1e-3)
+
+
 def test_noise_that_was_guessed_is_no_louder_than_what_is_left_of_other_samples():
     taps = np.tile([1.0, -0.8], (3, 1))  # rms level / 0.6
     left = np.column_stack([np.full(400, 0.3), np.full(400, 9.0), np.full(400, np.nan)])

@@ -31,7 +31,7 @@ from jaxsid.gap.locate import Scored, likeliest
 from jaxsid.gap.look import Look, at_likeliest, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
-from jaxsid.gap.null import Null, left_share
+from jaxsid.gap.null import Null, found_part
 from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, loud, notable, parsimonious
 from jaxsid.gap.refit import (
     Bench,
@@ -155,7 +155,8 @@ def causes_of(
     steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
     names = [s.name for s in model.sensors]
     # what is left is noise where tests find nothing in it, else more than that
-    told = bench.noises if look.clear else tuple(map(quieter, found.noises, bench.noises))
+    less = partial(quieter, found=found_part(look.null, look.fit))
+    told = bench.noises if look.clear else tuple(map(less, found.noises, bench.noises))
     floor = tuple(map(no_louder, told, steps[-1].left))
     *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
     if motions is not None:
@@ -486,8 +487,7 @@ def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
 
 def _least(look: Look) -> float:
     """Part of all that is left that a first effect must remove: tests may be certain of little, too."""
-    part = (look.null.share / max(left_share(look.fit), np.finfo(float).tiny)) ** 2
-    return min(LEAST, MOSTLY * part)
+    return min(LEAST, MOSTLY * found_part(look.null, look.fit))
 
 
 def _worth(ranking: Ranking, least: float) -> bool:

@@ -229,16 +229,26 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
 
 
-def quieter(guess: Noise, left: Noise) -> Noise:
-    """Each sensor's noise where all that tells of it is a guess: no more than a model leaves.
+def quieter(guess: Noise, left: Noise, found: float = 1.0) -> Noise:
+    """Each sensor's noise where all that tells of it is a guess: no more than a model leaves, nor less than tests miss.
+
+    Noise that is coloured, or shaken into the lines of a resonance, may be far above the quietest band.
 
     Args:
         guess: of a record; it stands where it is no guess.
         left: what a model leaves of that record, taken for noise.
+        found: part of that, in power, in which tests find more than noise.
     """
-    less = (guess.degrees <= 0) & (left.rms() < guess.rms())
-    level = np.where(less, left.level, guess.level)
-    return Noise(level, np.where(less[:, None], left.taps, guess.taps), guess.degrees, guess.source)
+    least = np.sqrt(max(0.0, 1.0 - found))
+    level = np.divide(guess.rms(), left.rms(), out=np.ones_like(guess.level), where=left.rms() > 0)
+    change = np.clip(level, least, 1.0)
+    own = (guess.degrees <= 0) & (change != level)
+    return Noise(
+        np.where(own, change * left.level, guess.level),
+        np.where(own[:, None], left.taps, guess.taps),
+        guess.degrees,
+        guess.source,
+    )
 
 
 def no_louder(noise: Noise, left: Float[np.ndarray, "samples outputs"]) -> Noise:

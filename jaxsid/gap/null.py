@@ -261,6 +261,16 @@ def left_share(fit: Recalibrated) -> float:
     return _mean(left_shares(fit))
 
 
+def found_part(null: Null, fit: Recalibrated) -> float:
+    """Part of what is left, in power, that tests find.
+
+    Args:
+        null: the tests.
+        fit: the model and what it leaves.
+    """
+    return (null.share / max(left_share(fit), np.finfo(float).tiny)) ** 2
+
+
 def left_shares(fit: Recalibrated) -> Float[np.ndarray, " outputs"]:
     """Likewise of each sensor; NaN for those that no record has.
 
