@@ -10,7 +10,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
 from jaxsid.gap import causes as module
-from jaxsid.gap.causes import LEAST, OFF, WORTH, _beyond, _Found, _off, _reconsidered, _worth
+from jaxsid.gap.causes import LEAST, OFF, WORTH, _beyond, _Found, _off, _reconsidered, worth
 from jaxsid.gap.explain import (
     ERRORS,
     TEMPERATURE,
@@ -164,18 +164,18 @@ def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
 
 
 def test_a_further_effect_must_be_worth_it():
-    def worth(gain, before, equations=1000, least=LEAST):
+    def enough(gain, before, equations=1000, least=LEAST):
         best, without = refit(gain, equations, equations), refit(0.0, before, equations)
         one = Explanation("backlash", B12, best, gain, 1.0, 1.0)
-        return _worth(Ranking((one,), without, 1.0, TEMPERATURE, BENCH), least)
+        return worth(Ranking((one,), without, 1.0, TEMPERATURE, BENCH), least)
 
-    assert worth(1.01 * WORTH * TEMPERATURE, 1500.0)
-    assert not worth(0.99 * WORTH * TEMPERATURE, 1500.0)
-    assert worth(101.0, 3000.0)
-    assert not worth(99.0, 3000.0)  # of the 2000 above the noise less than a tenth
-    assert worth(51.0, 1e4, equations=10000)
-    assert not worth(49.0, 1e4, equations=10000)  # there is nothing but noise, of which less than 1 %
-    assert worth(49.0, 1e4, equations=10000, least=0.009)
+    assert enough(1.01 * WORTH * TEMPERATURE, 1500.0)
+    assert not enough(0.99 * WORTH * TEMPERATURE, 1500.0)
+    assert enough(101.0, 3000.0)
+    assert not enough(99.0, 3000.0)  # of the 2000 above the noise less than a tenth
+    assert enough(51.0, 1e4, equations=10000)
+    assert not enough(49.0, 1e4, equations=10000)  # there is nothing but noise, of which less than 1 %
+    assert enough(49.0, 1e4, equations=10000, least=0.009)
     assert _beyond(refit(1.01 * WORTH), refit(0.0), 1.0)
     assert not _beyond(refit(1.01 * WORTH), refit(0.0), 1.1)
 

@@ -424,7 +424,7 @@ def taken(monkeypatch):
         monkeypatch.setattr(_Found, "taken", take)
         monkeypatch.setattr(causes, "looked", lambda *_: look)
         monkeypatch.setattr(causes, "rank", lambda *_: first)
-        monkeypatch.setattr(causes, "_worth", lambda of, least: True)
+        monkeypatch.setattr(causes, "worth", lambda of, least: True)
         monkeypatch.setattr(causes, "_least", lambda look: 0.0)
         monkeypatch.setattr(causes, "plainer", lambda *_: plain)
         at = _Found(BENCH, look, (), selected, refit(0.0) if selected else None)

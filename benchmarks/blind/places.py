@@ -27,6 +27,8 @@ import jaxsid
 from jaxsid.compilation import default_folder, keep_programs, release_programs
 from jaxsid.gap.locate import locate
 
+PART = 0.05  # of the response, from which on an effect is large
+
 
 def judged(out: Path, number: int) -> dict[str, Any]:
     """The line of a case that has been written.
@@ -61,17 +63,22 @@ def judged(out: Path, number: int) -> dict[str, Any]:
 
 
 def summary(lines: Iterable[dict[str, Any]]) -> list[str]:
-    """Shares over all cases whose gap counts, by sensors, noise, kind.
+    """Shares over all cases whose gap counts, by sensors, those of large effects, by kind.
 
     Args:
         lines: from `judged`.
     """
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for x in (x for x in lines if x["gap"] >= LEAST):
-        groups["all"].append(x)
-        groups[f"{x['sensors']} sensor(s)"].append(x)
-        groups[f"{x['sensors']} sensor(s), noise {x['noise']:g}"].append(x)
-        groups[x["kind"]].append(x)
+        seen = f"{x['sensors']} sensor(s)"
+        large = f"{seen}, 1 % noise at most, effect of 5 % of the response or more"
+        for name in (
+            "all",
+            seen,
+            *[large] * (x["noise"] < 0.02 and x["gap"] * x["noise"] >= PART),
+            x["kind"],
+        ):
+            groups[name].append(x)
 
     def mean(each: list[dict[str, Any]], what: str) -> float:
         return float(np.mean([x[what] for x in each]))

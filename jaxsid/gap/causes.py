@@ -28,11 +28,11 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored, likeliest
-from jaxsid.gap.look import Look, at_likeliest, candidates_of, looked, varied
+from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_of, looked, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
-from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, loud, notable, parsimonious
+from jaxsid.gap.ranking import WORTH, Explanation, Ranking, alike, key_of, loud, notable, parsimonious, worth
 from jaxsid.gap.refit import (
     Bench,
     Hypothesis,
@@ -51,11 +51,11 @@ from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
-WORTH, TELLING = 6.0, 4.0  # tempered gain of evidence from which on effects, and numbers, are taken
+TELLING = 4.0  # tempered gain of evidence from which on numbers are taken
+LACKING = 4  # springs, dampers, masses that are tried beside them
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
-LESS = 0.1  # part of what is left above the noise that a further effect must remove
-LEAST = 0.01  # and of all that is left, or of a first effect MOSTLY what tests find
+LEAST = 0.01  # part of all that is left that an effect must remove, or a first one MOSTLY what tests find
 MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
 CLOSELY = 6  # laws of the most probable place that are tried where none leaves little
@@ -195,11 +195,12 @@ def _searched(
         None,
     )
     if found.finding == "structure":
-        at = _effects(start, model, seen, say)
+        at, lacking = _effects(start, model, seen, say), ()
     else:
         within = refitted(start.bench, Hypothesis(), changes=changes_found(found))
         at = start._replace(before=within, look=start.look._replace(scored=None))
-    return _numbers(at, model, seen, say)
+        lacking = attached_candidates(start.look)[:LACKING]
+    return _numbers(at, lacking, model, seen, say)
 
 
 class _Found(NamedTuple):
@@ -342,7 +343,7 @@ def _further(
 ) -> _Found:
     """With one effect more, if any is worth it, and what is left then."""
     ranking = rank(at.bench, candidates, at.before, effort, say)
-    if not ranking.ranked or not _worth(ranking, LEAST if at.selected else _least(at.look)):
+    if not ranking.ranked or not worth(ranking, LEAST if at.selected else _least(at.look)):
         return at.refused(ranking)
     say("what is left")
     found = _left(at.taken(ranking), model, seen)
@@ -443,13 +444,21 @@ def _in_place(at: _Found, i: int, ranking: Ranking) -> _Found:
     return new._replace(rounds=tuple(rounds), selected=tuple(selected))
 
 
-def _numbers(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> _Found:
-    """Numbers of the model that are off by more than they may be, one after another, and gains that look like them."""
+def _numbers(
+    at: _Found,
+    lacking: tuple[Candidate, ...],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> _Found:
+    """Numbers of the model that are off by more than they may be, one after another, and what looks like them."""
     begun = len(at.selected)
     while len(at.selected) < MOST_EFFECTS and at.before is not None:
-        candidates = _off(at)
-        if not candidates:
+        off = _off(at)
+        if not off:
             return at
+        # the number farthest off, what the model lacks, the others
+        candidates = (*off[:1], *lacking, *off[1:])
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
         if ranking.gain <= TELLING:
             at = at.refused(ranking)
@@ -488,12 +497,3 @@ def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:
 def _least(look: Look) -> float:
     """Part of all that is left that a first effect must remove: tests may be certain of little, too."""
     return min(LEAST, MOSTLY * found_part(look.null, look.fit))
-
-
-def _worth(ranking: Ranking, least: float) -> bool:
-    """Whether the best further candidate explains much of what was left, and at least a part of all of it."""
-    best, without = ranking.ranked[0], ranking.without.fit
-    above = without.squares - without.equations
-    # of windows that lead to one another what is missed shows where they meet, too
-    less = 2 * (best.evidence - without.evidence)
-    return ranking.gain > WORTH and less > max(LESS * above, least * without.squares)

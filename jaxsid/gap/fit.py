@@ -211,9 +211,10 @@ def _evaluated(
     equations = sum(int(np.asarray(x.equations).sum()) for x in parts)
     squares = float(gram[:, -1, -1].sum())
     at = _At(theta, states, np.inf, squares, gram, equations, ends)
-    own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (_stray(at, prior, links) ** 2).sum()
-    own += (_jumps(at, prior, links) ** 2).sum()
-    cost = 0.5 * (squares + float(own))
+    with np.errstate(over="ignore"):  # a step too far is refused below
+        own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (_stray(at, prior, links) ** 2).sum()
+        own += (_jumps(at, prior, links) ** 2).sum()
+        cost = 0.5 * (squares + float(own))
     return at._replace(cost=cost) if np.isfinite(gram).all() and np.isfinite(cost) else at
 
 

@@ -16,6 +16,7 @@ from jaxsid.gap.ranking import ends_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import Bench, Refit
 from jaxsid.gap.screen import Candidate, screen
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
@@ -47,7 +48,21 @@ def candidates_of(look: Look) -> tuple[Candidate, ...]:
     Args:
         look: none come of a clear one.
     """
-    if look.scored is None or look.clear:
+    return () if look.clear else _screened(look, None)
+
+
+def attached_candidates(look: Look) -> tuple[Candidate, ...]:
+    """Likewise of springs, dampers and masses that the model lacks, which its own numbers may stand for.
+
+    Args:
+        look: may be clear.
+    """
+    lacking = [n for n, kind in CATALOGUE.items() if kind.needs == "apart" or kind.vibrates is not None]
+    return _screened(look, tuple(lacking))
+
+
+def _screened(look: Look, kinds: tuple[str, ...] | None) -> tuple[Candidate, ...]:
+    if look.scored is None:
         return ()
     of, rows = (
         look.scored,
@@ -58,7 +73,9 @@ def candidates_of(look: Look) -> tuple[Candidate, ...]:
         "refitted model": [look.fit.linear[i].motion for i in rows],
     }
     left = [np.abs(np.asarray(look.fit.linear[i].left)) for i in rows]
-    return screen(of.model, [of.settings[i] for i in rows], of.places, motions, of.tolerance, left)
+    return screen(
+        of.model, [of.settings[i] for i in rows], of.places, motions, of.tolerance, left, kinds=kinds
+    )
 
 
 def _telling(present: Sequence[np.ndarray], of: Scored) -> list[int]:

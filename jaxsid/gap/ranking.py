@@ -11,6 +11,8 @@ from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import GROUND
 
+WORTH = 6.0  # tempered gain of evidence from which on effects are taken
+LESS = 0.1  # part of what is left above the noise that an effect must remove
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ from them as they are
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
@@ -300,3 +302,17 @@ def ranked(
         temperature,
         bench,
     )
+
+
+def worth(ranking: Ranking, least: float) -> bool:
+    """Whether the best candidate explains much of what was left, and at least a part of all of it.
+
+    Args:
+        ranking: of a round.
+        least: that part.
+    """
+    best, without = ranking.ranked[0], ranking.without.fit
+    above = without.squares - without.equations
+    # of windows that lead to one another what is missed shows where they meet, too
+    less = 2 * (best.evidence - without.evidence)
+    return ranking.gain > WORTH and less > max(LESS * above, least * without.squares)
