@@ -162,6 +162,18 @@ def test_wrong_numbers_are_named():
         assert abs(factor["value"] - 1 / 1.05) < 5 * factor["std"]
 
 
+def test_a_spring_that_the_model_lacks_is_not_taken_for_wrong_numbers():
+    """One sensor, whose readings the model's own numbers would give, several of them off by more than they may be."""
+    u, lone = drive(), ((0, "acceleration"),)
+    y = noisy(with_effect(u, "missing_connection", (0, 2), {"stiffness": 15.0, "damping": 0.0}, lone))
+    found = diagnose(chain(lone), record(u, y, lone))
+    assert found.examination.finding == "parameters"
+    (one,) = found.as_dict()["selected"]
+    assert (one["kind"], one["place"]) == ("missing_connection", {"between": ["b1", "b3"]})
+    stiffness = one["parameters"]["stiffness"]
+    assert abs(stiffness["value"] - 15.0) < 4 * stiffness["std"] < 15.0
+
+
 def test_places_of_numbers_have_two_ends_or_a_body_for_matrices_too():
     assert element_place(chain(), Element("c1", "damping")) == {"between": ["ground", "b1"]}
     assert element_place(chain(), Element("b2", "mass")) == {"body": "b2"}
