@@ -18,6 +18,7 @@ from jaxsid.report import plots
 from jaxsid.report.findings import BY_ELEMENTS, matrices_section
 from jaxsid.report.frame import Table, Text
 from jaxsid.report.modes import connecting, displacement_shapes, modes_of
+from jaxsid.report.style import new_figure, scaled
 
 FIGURES = {
     "time": lambda found: plots.time_figure(found, "acc2"),
@@ -176,3 +177,13 @@ def test_elements_are_read_off_the_matrices(found):
     value, std = connecting(found, "stiffness", ("ground", "base"))
     assert value == pytest.approx(40e3 * 1.001)
     assert std == pytest.approx(0.006 * 70e3)
+
+
+@pytest.mark.parametrize(
+    ("which", "size", "text"),
+    [("y", 999.0, "force (N)"), ("y", 1500.0, "force (10³ N)"), ("x", 1500.0, "force (N)")],
+)
+def test_a_vertical_axis_has_room_for_three_digits(which, size, text):
+    figure, axes = new_figure("Force", 2.0)
+    scaled(axes[0, 0], which, "force (N)", size)
+    assert getattr(axes[0, 0], f"get_{which}label")() == text

@@ -151,7 +151,8 @@ def frequency_scale(ax: Axes, low: float, high: float) -> None:
 def scaled(ax: Axes, which: str, text: str, size: float) -> None:
     """Label an axis; values far from 1 are shown in a power of ten that the label names, before the unit."""
     exponent = 3 * int(np.floor(np.log10(size) / 3)) if size > 0 and np.isfinite(size) else 0
-    exponent = 0 if 0.05 <= size < 10_000 else exponent
+    # beside a vertical axis there is room for three digits and a sign
+    exponent = 0 if 0.05 <= size < (10_000 if which == "x" else 1_000) else exponent
     axis = getattr(ax, f"{which}axis")
     axis.set_major_formatter(FuncFormatter(lambda v, _: minus(f"{v / 10.0**exponent:.6g}")))
     if exponent:
