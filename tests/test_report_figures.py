@@ -184,6 +184,6 @@ def test_elements_are_read_off_the_matrices(found):
     [("y", 999.0, "force (N)"), ("y", 1500.0, "force (10³ N)"), ("x", 1500.0, "force (N)")],
 )
 def test_a_vertical_axis_has_room_for_three_digits(which, size, text):
-    figure, axes = new_figure("Force", 2.0)
+    _, axes = new_figure("Force", 2.0)
     scaled(axes[0, 0], which, "force (N)", size)
     assert getattr(axes[0, 0], f"get_{which}label")() == text

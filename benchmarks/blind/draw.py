@@ -340,7 +340,7 @@ def drawn_case(which: str, case: Planned, samples: tuple[int, int] = SAMPLES) ->
     """Of a set, by its plan.
 
     Args:
-        which: "dev" or "test".
+        which: one of `SETS`.
         case: of `plan`.
         samples: of the two records.
     """

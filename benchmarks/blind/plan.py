@@ -8,14 +8,17 @@ from laws import CATALOGUE, INPUT, OUTSIDE, SENSOR
 
 CYCLE = 240  # cases after which shares are as they should be
 NONE, PAIRS, UNKNOWN = 48, 48, 36  # of a cycle; the rest has one effect
-SETS = {"dev": 7_100_000, "test": 9_300_000}  # seeds, far apart
+# seeds, far apart; the second test set is there because the first has been looked at since it was scored
+SETS = {"dev": 7_100_000, "test": 9_300_000, "second": 11_900_000}
 NOISES = ((0.01, 0.6), (0.001, 0.2), (0.05, 0.2))
 FAMILIES = {
     "dev": ("mass", "chain", "drive", "frame", "tree", "tree", "tree"),
     "test": ("mass", "chain", "drive", "frame"),
+    "second": ("mass", "chain", "drive", "frame"),
 }
 # of a cycle's cases, by family in the order above: a mass says little about places
-SHARES = {"dev": (0.1, 0.15, 0.1, 0.15, 0.2, 0.15, 0.15), "test": (0.15, 0.35, 0.2, 0.3)}
+TESTED = (0.15, 0.35, 0.2, 0.3)
+SHARES = {"dev": (0.1, 0.15, 0.1, 0.15, 0.2, 0.15, 0.15), "test": TESTED, "second": TESTED}
 ONE_SENSOR, COLOURED = 0.15, 0.2
 
 
@@ -89,7 +92,7 @@ def plan(which: str, cases: int) -> list[Planned]:
     """What each case of a set holds.
 
     Args:
-        which: "dev" or "test".
+        which: one of `SETS`.
         cases: how many; shares hold for whole cycles.
     """
     found: list[Planned] = []
