@@ -13,16 +13,13 @@ from jaxsid.checks import InputError, is_concrete
 from jaxsid.compilation import compiled
 from jaxsid.least_squares import forward, levenberg_marquardt
 from jaxsid.mechanics.band import extend
-from jaxsid.mechanics.dry_friction import acting
 from jaxsid.mechanics.effects.catalogue import by_sort
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.nonlinear import Response, respond, respond_twice, state_count
 from jaxsid.mechanics.slots import Slots, slots_of
 from jaxsid.records import SecondOrderModel
 
-# estimated relative error of every output at which steps are short enough: half of what is promised, and less with dry
-# friction, which makes readings jump as it turns, so that an estimate tells less
-GOOD, GOOD_DRY = 5e-5, 3e-5
+GOOD = 3e-5  # relative error of every output at which steps are short enough
 MOST_SUBSTEPS = 64
 PLAIN_SUBSTEPS = 4  # where values are traced, so that nobody can look at the error
 FINER = 8  # samples of a band-limited input for each given one
@@ -144,7 +141,6 @@ def run_driven(given: Driven, state: Float[Array, " n"], substeps: int | None = 
     if substeps is not None or not all(map(is_concrete, jax.tree.leaves((given, state)))):
         number = substeps or PLAIN_SUBSTEPS
         return Motion(_respond_plain(given, state, substeps=number), number, unknown)
-    good = GOOD_DRY if acting(given.slots.kinds) else GOOD
     number, (last, found) = 2, _respond_twice(given, state)
     while True:
         error = _relative_change(last.outputs, found.outputs)
@@ -153,7 +149,7 @@ def run_driven(given: Driven, state: Float[Array, " n"], substeps: int | None = 
                 "the motion grows beyond all bounds: the model with these effects is unstable. Check the signs and "
                 "sizes of the effects' parameters."
             )
-        if (error < good).all() or number >= MOST_SUBSTEPS:
+        if (error < GOOD).all() or number >= MOST_SUBSTEPS:
             return Motion(found, number, error)
         number, last = 2 * number, found
         found = _respond(given, state, jnp.asarray(number))
