@@ -69,7 +69,8 @@ def line_over_step(late: Late, begin: Array, length: Array) -> tuple[Array, Arra
         begin: of the step, in sampling intervals.
         length: of the step, in sampling intervals.
     """
-    part = jnp.clip((late.arrival - begin) / length, 0.0, 1.0)  # of the step, before the arrival
+    # of the step, before the arrival; a quotient in a loop would be computed apart from all else
+    part = jnp.clip((late.arrival - begin) * (1 / length), 0.0, 1.0)
     jump, bend = late.new - late.old, (late.old_slope - late.new_slope) * length
     middle = late.new + late.new_slope * (begin + 0.5 * length - late.arrival)
     mean = middle - jump * part - 0.5 * bend * part**2

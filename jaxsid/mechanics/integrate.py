@@ -147,23 +147,24 @@ def integrate(
         substeps: steps for each sampling interval; a traced number costs reverse differentiation.
         first: number of the first sample in the record.
     """
-    h = dt / substeps
+    h, length = dt / substeps, 1 / jnp.asarray(substeps, state.dtype)
     step = step_of(system, moved_by(system, jnp.stack([h, h / 2])))
 
-    def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
+    def sample(carry: tuple, row: Array) -> tuple[tuple, tuple[Array, Array]]:
         x, sliding = carry
 
         def one(i: Array, carry: _Carry) -> _Carry:
-            return _advance(
-                system, slots, step, dt, row, (i / substeps, 1 / jnp.asarray(substeps, x.dtype)), carry
-            )
+            # else parts of it are computed one by one before the loop, which costs more than within
+            i, held = lax.optimization_barrier((i, row))
+            return _advance(system, slots, step, dt, held, (i * length, length), carry)
 
         begin = _Carry(x, sliding, jnp.zeros(2 * slots.count, x.dtype))
         x1, after, mean = lax.fori_loop(0, substeps, one, begin)
-        return (x1, after), jnp.concatenate([x, sliding, mean])
+        # the mean by itself: few ask for it, and where none does it is not computed
+        return (x1, after), (jnp.concatenate([x, sliding]), mean)
 
     _, found = lax.scan(sample, (state, _sliding_at(system, slots, state)), _rows(late, first, state))
-    return _path(found, system, slots)
+    return _path(*found, system)
 
 
 def integrate_twice(
@@ -184,7 +185,7 @@ def integrate_twice(
     steps = jax.vmap(lambda h: step_of(system, moved_by(system, jnp.stack([h, h / 2]))))(lengths * dt)
     half = jax.tree.map(lambda x: x[1], steps)
 
-    def sample(carry: tuple, row: Array) -> tuple[tuple, Array]:
+    def sample(carry: tuple, row: Array) -> tuple[tuple, tuple[Array, Array]]:
         x, sliding = carry
         still = jnp.zeros((2, 2 * slots.count), x.dtype)
         one, two = (_Carry(x[i], sliding[i], still[i]) for i in range(2))
@@ -195,11 +196,12 @@ def integrate_twice(
 
         both = jax.tree.map(lambda *x: jnp.stack(x), one, two)
         x1, after, mean = jax.vmap(last)(steps, begins, lengths, both)
-        return (x1, after), jnp.concatenate([x, sliding, mean], axis=1)
+        return (x1, after), (jnp.concatenate([x, sliding], axis=1), mean)
 
     begin = (jnp.stack([x, x]) for x in (state, _sliding_at(system, slots, state)))
     _, found = lax.scan(sample, tuple(begin), _rows(late, 0, state))
-    return _path(found[:, 0], system, slots), _path(found[:, 1], system, slots)
+    one, two = (_path(*(x[:, i] for x in found), system) for i in range(2))
+    return one, two
 
 
 class _Carry(NamedTuple):
@@ -252,9 +254,8 @@ def _rows(late: Late, first: int | Array, state: Array) -> Array:
     return jnp.concatenate([*late[:4], arrival, numbers[:, None]], axis=1)
 
 
-def _path(found: Array, system: Augmented, slots: Slots) -> Path:
-    n = len(system.A)
-    return Path(*jnp.split(found, [n, n + slots.count], axis=1))
+def _path(found: Array, mean: Array, system: Augmented) -> Path:
+    return Path(*jnp.split(found, [len(system.A)], axis=1), mean)
 
 
 def _sliding_at(system: Augmented, slots: Slots, state: Array) -> Array:
