@@ -154,17 +154,16 @@ def integrate(
         x, sliding = carry
 
         def one(i: Array, carry: _Carry) -> _Carry:
-            # else parts of it are computed one by one before the loop, which costs more than within
-            i, held = lax.optimization_barrier((i, row))
-            return _advance(system, slots, step, dt, held, (i * length, length), carry)
+            return _advance(system, slots, step, dt, row, (i * length, length), carry)
 
         begin = _Carry(x, sliding, jnp.zeros(2 * slots.count, x.dtype))
         x1, after, mean = lax.fori_loop(0, substeps, one, begin)
         # the mean by itself: few ask for it, and where none does it is not computed
         return (x1, after), (jnp.concatenate([x, sliding]), mean)
 
-    _, found = lax.scan(sample, (state, _sliding_at(system, slots, state)), _rows(late, first, state))
-    return _path(*found, system)
+    begin = state, _sliding_at(system, slots, state)
+    _, (found, mean) = lax.scan(sample, begin, _rows(late, first, state))
+    return _path(found, mean, system)
 
 
 def integrate_twice(
@@ -199,8 +198,8 @@ def integrate_twice(
         return (x1, after), (jnp.concatenate([x, sliding], axis=1), mean)
 
     begin = (jnp.stack([x, x]) for x in (state, _sliding_at(system, slots, state)))
-    _, found = lax.scan(sample, tuple(begin), _rows(late, 0, state))
-    one, two = (_path(*(x[:, i] for x in found), system) for i in range(2))
+    _, (found, mean) = lax.scan(sample, tuple(begin), _rows(late, 0, state))
+    one, two = (_path(found[:, i], mean[:, i], system) for i in range(2))
     return one, two
 
 
@@ -223,6 +222,10 @@ def _advance(
 ) -> _Carry:
     """One step, which begins and lasts the two given parts of the sample of a row."""
     x, sliding, total = carry
+    # else each number that a law needs is computed before the loop, and every kernel is handed dozens of arrays
+    arrays, known = eqx.partition(slots, eqx.is_array)
+    x, row, arrays = lax.optimization_barrier((x, row, arrays))
+    slots = eqx.combine(arrays, known)
     begin, length = part
     n, count, inputs = len(system.A), slots.count, system.B.shape[1]
     speeds, h = system.seen[count : 2 * count], length * dt
@@ -255,7 +258,8 @@ def _rows(late: Late, first: int | Array, state: Array) -> Array:
 
 
 def _path(found: Array, mean: Array, system: Augmented) -> Path:
-    return Path(*jnp.split(found, [len(system.A)], axis=1), mean)
+    states, sliding = jnp.split(found, [len(system.A)], axis=1)
+    return Path(states, sliding, mean)
 
 
 def _sliding_at(system: Augmented, slots: Slots, state: Array) -> Array:
