@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxsid.gap.nested import nested
 from jaxsid.gap.ranking import (
     Explanation,
     Key,
@@ -326,7 +327,7 @@ def _round(
             values = [x if i in done else min(x, top - near) for i, x in enumerate(values)]
             break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
-    return _compared(rough, values, done, bench, without, effort)
+    return nested(_compared(rough, values, done, bench, without, effort), effort.steps, say)
 
 
 def _due(

@@ -1,0 +1,78 @@
+"""Laws of fewer numbers begun where the best law at their place ended.
+
+A fit of friction or contact has many valleys, in which the states of windows are wrong as much as the law is. A law
+that the best one holds as a special case lies in the same valley as it; from a start of its own it may not get there.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxsid.gap.ranking import (
+    Explanation,
+    Ranking,
+    Whole,
+    ends_of,
+    key_of,
+    left_in,
+    numbers_of,
+    ranked,
+    value,
+)
+from jaxsid.gap.refit import Refit, changes_of, refitted, states_without
+from jaxsid.parallel import side_by_side
+
+FEWER = 2  # that are tried
+NEAR = 4.0  # times what the best one leaves, from which on none is
+GAIN = 2.0  # of the search, below which it has come to an end
+
+
+def nested(ranking: Ranking, steps: int, say: Callable[[str], None]) -> Ranking:
+    """A round in which laws of fewer numbers at the place of the best one begin from its states, if that is better.
+
+    Args:
+        ranking: the round.
+        steps: most evaluations of a fit.
+        say: called with a line of text before each fit.
+    """
+    if not ranking.ranked:
+        return ranking
+    best, others = ranking.ranked[0], ranking.ranked[1:]
+    due = [y for y in others if _within(y, best)][:FEWER]
+
+    def begun(y: Explanation) -> Refit:
+        say(f"{y.kind} from where {best.kind} ends")
+        start = {"changes": changes_of(best.refit, ranking.bench), "states": _states_beside(best)}
+        return refitted(ranking.bench, y.refit.hypothesis, **start, steps=steps, gain=GAIN)
+
+    new = dict(zip([y.key for y in due], side_by_side(begun, due), strict=True))
+    better = {y.key for y in due if value(new[y.key], ranking.bench) > y.evidence}
+    if not better:
+        return ranking
+    every = []
+    for y in ranking.ranked:
+        if y.key in better:
+            found = new[y.key]
+            left = left_in(ranking.bench, Whole(ranking.bench, found))
+            every.append((y, found, value(found, ranking.bench), left))
+        else:
+            every.append((y, y.refit, y.evidence, y.left))
+    return ranked(every, ranking.without, ranking.bench, ranking.temperature)
+
+
+def _states_beside(best: Explanation) -> tuple[np.ndarray, ...]:
+    """States of windows in a fit, without those of its law's own."""
+    effects = best.refit.hypothesis.effects
+    row = next(i for i, e in enumerate(effects) if key_of(e.kind, dict(e.place)) == best.key)
+    return states_without(best.refit, row)
+
+
+def _within(y: Explanation, best: Explanation) -> bool:
+    """Whether a law of fewer numbers acts where the best one does, and hardly leaves more."""
+    return (
+        ends_of(y.place) == ends_of(best.place)
+        and numbers_of(y.kind) < numbers_of(best.kind)
+        and math.isfinite(y.evidence)
+        and y.left < NEAR * best.left
+    )
