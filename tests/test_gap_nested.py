@@ -1,6 +1,6 @@
 """Laws of fewer numbers begin where the best law at their place ended."""
 
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ from jaxsid.gap import nested as module
 from jaxsid.gap.examine import examine
 from jaxsid.gap.explain import TEMPERATURE, extended
 from jaxsid.gap.nested import FEWER, NEAR, nested
-from jaxsid.gap.ranking import Whole, left_in, ranked
+from jaxsid.gap.ranking import Whole, key_of, left_in, ranked
 from jaxsid.gap.refit import Hypothesis, bench_of, refitted
 from jaxsid.mechanics.lumped import Effect
 
@@ -25,12 +25,12 @@ def silent(text: str) -> None:
     """Says nothing."""
 
 
-def round_of(*laws):
+def round_of(*laws, errors=MappingProxyType({})):
     """Kind, place, evidence, and rms that is left, best first."""
     every = []
     for kind, place, evidence, left in laws:
         c = candidate(kind, place)
-        every.append((c, refit(evidence, hypothesis=extended(Hypothesis(), c, {})), evidence, left))
+        every.append((c, refit(evidence, hypothesis=extended(Hypothesis(), c, errors)), evidence, left))
     return ranked(every, refit(-1e9), BENCH, TEMPERATURE)
 
 
@@ -88,6 +88,13 @@ def test_a_round_of_nothing_stays(begun):
     assert nested(empty, STEPS, silent) is empty
     alone = round_of(("coulomb_friction", B12, 0.0, 1.0))
     assert nested(alone, STEPS, silent) is alone
+
+
+def test_a_wrong_number_of_the_model_holds_no_other_law(begun):
+    errors = {key_of("damping_error", B12): (4,)}
+    laws = ("damping_error", B12, 0.0, 1.0), ("coulomb_friction", B12, -1.0, 1.1)
+    first = round_of(*laws, errors=errors)
+    assert begun(first, {}) == (first, [])
 
 
 @pytest.fixture(scope="module")

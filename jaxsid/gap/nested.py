@@ -7,8 +7,6 @@ that the best one holds as a special case lies in the same valley as it; from a 
 import math
 from collections.abc import Callable
 
-import numpy as np
-
 from jaxsid.gap.ranking import (
     Explanation,
     Ranking,
@@ -36,14 +34,15 @@ def nested(ranking: Ranking, steps: int, say: Callable[[str], None]) -> Ranking:
         steps: most evaluations of a fit.
         say: called with a line of text before each fit.
     """
-    if not ranking.ranked:
+    row = _row(ranking.ranked[0]) if ranking.ranked else None
+    if row is None:
         return ranking
     best, others = ranking.ranked[0], ranking.ranked[1:]
     due = [y for y in others if _within(y, best)][:FEWER]
 
     def begun(y: Explanation) -> Refit:
         say(f"{y.kind} from where {best.kind} ends")
-        start = {"changes": changes_of(best.refit, ranking.bench), "states": _states_beside(best)}
+        start = {"changes": changes_of(best.refit, ranking.bench), "states": states_without(best.refit, row)}
         return refitted(ranking.bench, y.refit.hypothesis, **start, steps=steps, gain=GAIN)
 
     new = dict(zip([y.key for y in due], side_by_side(begun, due), strict=True))
@@ -61,11 +60,10 @@ def nested(ranking: Ranking, steps: int, say: Callable[[str], None]) -> Ranking:
     return ranked(every, ranking.without, ranking.bench, ranking.temperature)
 
 
-def _states_beside(best: Explanation) -> tuple[np.ndarray, ...]:
-    """States of windows in a fit, without those of its law's own."""
-    effects = best.refit.hypothesis.effects
-    row = next(i for i, e in enumerate(effects) if key_of(e.kind, dict(e.place)) == best.key)
-    return states_without(best.refit, row)
+def _row(x: Explanation) -> int | None:
+    """Which effect of its fit a law is; None where it is a wrong number of the model, which holds no other."""
+    rows = [i for i, e in enumerate(x.refit.hypothesis.effects) if key_of(e.kind, dict(e.place)) == x.key]
+    return rows[0] if rows else None
 
 
 def _within(y: Explanation, best: Explanation) -> bool:
