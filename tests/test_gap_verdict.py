@@ -21,7 +21,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
 
-def examination(nominal=1e-9, structural=1e-9, finding=None):
+def examination(nominal=1e-9, structural=1e-9, finding="structure"):
     given = dict.fromkeys(Examination._fields)
     said = {"nominal_p_value": nominal, "structural_p_value": structural, "finding": finding}
     return Examination(**{**given, **said})
@@ -136,6 +136,12 @@ def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
     linear = closure(0.0101, recalibrated=0.0102)
     assert linear.against_recalibrated < 0.5
     assert verdict_of(examination(), causes(ranking(0.0), closures=[linear])).name == "effect"
+    # and where tests of the samples seen find no more than that model explains, whatever it leaves of others
+    beyond = causes(ranking(0.0), closures=[closure(0.025, recalibrated=0.03)])
+    assert verdict_of(examination(finding="structure"), beyond).name == "unknown"
+    assert verdict_of(examination(finding="parameters"), beyond).name == "effect"
+    little = causes(ranking(0.0), closures=[closure(0.25, recalibrated=0.26)])
+    assert verdict_of(examination(finding="parameters"), little).name == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -181,6 +187,7 @@ def test_two_springs_at_one_place_imitate_one_of_another_shape():
     assert both.name == "unknown"
     assert both.probability["unknown"] == IMITATED
     assert [x.kind for x in both.imitating] == ["end_stop", "cubic_stiffness"]
+    assert said(("cogging_ripple", B12), ("end_stop", B12)).name == "unknown"
     # a polynomial, other places, other laws
     assert said(("quadratic_stiffness", B12), ("cubic_stiffness", B12)).name == "effect"
     assert said(("end_stop", B12), ("cubic_stiffness", B23)).name == "effect"
@@ -190,7 +197,7 @@ def test_two_springs_at_one_place_imitate_one_of_another_shape():
 def test_springs_of_the_catalogue_are_curves_over_the_displacement():
     springs = [k for k in CATALOGUE.values() if k.restoring and not k.states]
     assert len(springs) >= 5
-    d = jnp.linspace(-0.9, 0.9, 9)
+    d = jnp.linspace(-3.0, 3.0, 9)
     at = lambda v, t: Motion(d, *(x + 0 * d for x in (v, 0.0, t, 3.0)))  # noqa: E731
     for kind in springs:
         numbers = [jnp.asarray(0.4 + 0.1 * i) for i in range(len(kind.parameters))]

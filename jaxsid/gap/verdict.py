@@ -70,7 +70,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     imitating = _imitating(causes.selected)
-    unexplained = max(_unexplained(causes, found.finding == "structure"), IMITATED if imitating else 0.0)
+    unexplained = max(_unexplained(causes, found.finding), IMITATED if imitating else 0.0)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
@@ -88,14 +88,18 @@ def _slight(found: Examination) -> bool:
     return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
-def _unexplained(causes: Causes, structural: bool) -> float:
-    """Probability that the law is not among those tried: by how much of the gap the best one leaves."""
+def _unexplained(causes: Causes, finding: str) -> float:
+    """Probability that the law is not among those tried: by how much of the gap the best one leaves.
+
+    Beside the best linear model only where tests find more than it explains: what that leaves of other samples, near a
+    resonance of which those seen tell little, is its own error.
+    """
     last = causes.closures[-1]
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1.0
     # what comes nearest to a law that is not there explains most of its gap, but not to the noise
-    more = structural and last.after > SURE * last.noise_floor
-    beyond = more or substantial(last.recalibrated, last.noise_floor)
+    more = finding == "structure" and last.after > SURE * last.noise_floor
+    beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
