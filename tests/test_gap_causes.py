@@ -10,9 +10,8 @@ from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
 from jaxsid.gap import causes as module
-from jaxsid.gap.causes import LEAST, OFF, WORTH, _beyond, _Found, _off, _reconsidered, worth
+from jaxsid.gap.causes import LEAST, OFF, _beyond, _Found, _off, _reconsidered
 from jaxsid.gap.explain import (
-    ERRORS,
     TEMPERATURE,
     _distinct,
     _values,
@@ -22,7 +21,7 @@ from jaxsid.gap.explain import (
 )
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
-from jaxsid.gap.ranking import Explanation, Ranking, alike, key_of, ranked
+from jaxsid.gap.ranking import ERRORS, WORTH, Explanation, Ranking, alike, key_of, numbers_of, ranked, worth
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.lumped import Connection, Effect, Input, Matrices, Sensor, lumped_model, second_order
@@ -92,6 +91,12 @@ def test_every_number_of_a_model_is_the_error_of_one_effect(model):
         # a mass between two bodies is no mass of a body
         assert (where == "body") == (kind == "mass_error" and len(ends) == 1)
         assert where == "body" or len(ends) == 2
+
+
+def test_a_wrong_number_is_one_whichever_way_it_is_told():
+    assert [numbers_of(kind) for kind in ERRORS.values()] == [1, 1, 1]
+    assert numbers_of("missing_connection") == 2
+    assert numbers_of("stribeck_friction") == 3
 
 
 def test_numbers_bear_the_names_of_places():

@@ -12,12 +12,12 @@ from jaxsid.gap.closely import LENGTH, followed_closely
 from jaxsid.gap.closure import Closure
 from jaxsid.gap.examine import Examination, examine
 from jaxsid.gap.experiment import Experiment, experiment_between
-from jaxsid.gap.explain import ERRORS, element_place, elements_by_key
+from jaxsid.gap.explain import element_place, elements_by_key
 from jaxsid.gap.held_out import seen_part, usual_end
 from jaxsid.gap.later import later_than_agreed
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import SOURCES
-from jaxsid.gap.ranking import Explanation, Key, Ranking, alike, key_of
+from jaxsid.gap.ranking import ERRORS, Explanation, Key, Ranking, alike, key_of
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
 from jaxsid.gap.words import about_inputs, about_numbers, next_experiment, remaining, summary

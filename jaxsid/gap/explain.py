@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxsid.gap.nested import nested
 from jaxsid.gap.ranking import (
+    ERRORS,
     Explanation,
     Key,
     Ranking,
@@ -63,7 +64,6 @@ FINE = 2.0  # gain of the search below which a candidate is fitted well enough t
 MORE = 3  # further ones that are fitted thoroughly as those before them turn out worse than they seemed
 CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 SPRING = "missing_connection"
-ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 
 
 class Effort(NamedTuple):

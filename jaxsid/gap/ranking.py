@@ -18,6 +18,8 @@ STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ f
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
+# kinds that are a wrong number of the model
+ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
 
 
@@ -198,12 +200,12 @@ def straight(kind: str) -> bool:
 
 
 def numbers_of(kind: str) -> int:
-    """How many numbers a kind of effect has.
+    """How many numbers a kind of effect has; a wrong number of the model is one, whichever way it is told.
 
     Args:
         kind: its name.
     """
-    return len(CATALOGUE[kind].parameters)
+    return 1 if kind in ERRORS.values() else len(CATALOGUE[kind].parameters)
 
 
 def loud(ranking: Ranking) -> bool:

@@ -7,8 +7,9 @@ from jaxtyping import Array, Float
 
 from jaxsid.compilation import compiled
 from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.explain import ERRORS, element_place
+from jaxsid.gap.explain import element_place
 from jaxsid.gap.force_map import ForceMap
+from jaxsid.gap.ranking import ERRORS
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, parameter_row
 from jaxsid.mechanics.effects.kind import Kind, Motion, Nominal
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, second_order, with_effects
