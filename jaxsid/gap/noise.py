@@ -1,10 +1,11 @@
 """Level and colour of each sensor's noise, from the best part of the records that tells of it.
 
 In this order: periods of a periodic record, records of equal inputs, a part without input, and else the quietest band
-of what a model leaves. Free decays are taken out of all of them.
+of what a model leaves. Free decays are taken out of all of them. Motion that does not repeat under a periodic input,
+as in contact, is no noise: where a sensor differs from period to period far more than in another record, that tells.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +22,7 @@ from jaxsid.records import Record
 
 SAME_INPUT = 0.02  # rms of a difference between two inputs, next to theirs, that are one
 SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, that is still noise
+UNLIKE = 5.0  # times a sensor's noise in another record, from which on what does not repeat is motion
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
@@ -71,9 +73,20 @@ def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]
         InputError: an input or all sensors of a record are missing.
     """
     require(len(records) > 0, "give at least one record.")
-    return tuple(
-        _at_least(_of_record(model, r, [x for x in records if x is not r]), model, r) for r in records
-    )
+    found = [_of_record(model, r, [x for x in records if x is not r]) for r in records]
+    like = [
+        _as_elsewhere(n, r, zip(found, records, strict=True)) for n, r in zip(found, records, strict=True)
+    ]
+    return tuple(_at_least(n, model, r) for n, r in zip(like, records, strict=True))
+
+
+def _as_elsewhere(noise: Noise, record: Record, every: Iterable[tuple[Noise, Record]]) -> Noise:
+    """What does not repeat in a record, if it is noise; else that of the quietest other one, sampled alike."""
+    others = [n for n, r in every if n.degrees > 0 and np.isclose(float(r.dt), float(record.dt))]
+    louder = lambda n: float(np.nan_to_num(noise.rms() / n.rms(), nan=0.0).max(initial=0.0))  # noqa: E731
+    quietest = max(others, key=louder, default=noise)
+    same = np.isfinite(noise.level) == np.isfinite(quietest.level)
+    return quietest if noise.degrees > 0 and louder(quietest) > UNLIKE and same.all() else noise
 
 
 def _at_least(noise: Noise, model: LumpedModel, record: Record) -> Noise:
