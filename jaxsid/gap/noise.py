@@ -23,6 +23,7 @@ from jaxsid.records import Record
 SAME_INPUT = 0.02  # rms of a difference between two inputs, next to theirs, that are one
 SAME_PERIOD = 1.5  # level of a difference between periods, next to the least, that is still noise
 UNLIKE = 5.0  # times a sensor's noise in another record, from which on what does not repeat is motion
+LARGE_PART = 0.2  # of a sensor's signal, from which on it is that
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
@@ -74,16 +75,21 @@ def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]
     """
     require(len(records) > 0, "give at least one record.")
     found = [_of_record(model, r, [x for x in records if x is not r]) for r in records]
-    like = [
-        _as_elsewhere(n, r, zip(found, records, strict=True)) for n, r in zip(found, records, strict=True)
-    ]
+    every = list(zip(found, records, strict=True))
+    like = [_as_elsewhere(n, model, r, every) for n, r in every]
     return tuple(_at_least(n, model, r) for n, r in zip(like, records, strict=True))
 
 
-def _as_elsewhere(noise: Noise, record: Record, every: Iterable[tuple[Noise, Record]]) -> Noise:
-    """What does not repeat in a record, if it is noise; else that of the quietest other one, sampled alike."""
+def _as_elsewhere(
+    noise: Noise, model: LumpedModel, record: Record, every: Iterable[tuple[Noise, Record]]
+) -> Noise:
+    """What does not repeat in a record, if it is noise; else that of the quietest other one, sampled alike.
+
+    Noise may well be louder in one record, of a sensor in another range, but is hardly a large part of what it reads.
+    """
     others = [n for n, r in every if n.degrees > 0 and np.isclose(float(r.dt), float(record.dt))]
-    louder = lambda n: float(np.nan_to_num(noise.rms() / n.rms(), nan=0.0).max(initial=0.0))  # noqa: E731
+    large = noise.rms() > LARGE_PART * _signal_rms(model, record)
+    louder = lambda n: float(np.where(large, noise.rms() / n.rms(), 0.0).max(initial=0.0))  # noqa: E731
     quietest = max(others, key=louder, default=noise)
     same = np.isfinite(noise.level) == np.isfinite(quietest.level)
     return quietest if noise.degrees > 0 and louder(quietest) > UNLIKE and same.all() else noise
@@ -91,10 +97,16 @@ def _as_elsewhere(noise: Noise, record: Record, every: Iterable[tuple[Noise, Rec
 
 def _at_least(noise: Noise, model: LumpedModel, record: Record) -> Noise:
     """The same where there is noise at all; records that were computed may have none."""
+    least = FINEST * _signal_rms(model, record)
+    return eqx.tree_at(lambda n: n.level, noise, np.fmax(noise.level, least) + 0 * noise.level)
+
+
+def _signal_rms(model: LumpedModel, record: Record) -> Float[np.ndarray, " outputs"]:
+    """What each of the model's sensors reads, rms; 0 for absent ones."""
     rows, columns = measured_sensors(model, record)
     rms = np.zeros(len(model.sensors))
     rms[rows] = np.sqrt((np.asarray(record.y)[:, columns] ** 2).mean(axis=0))
-    return eqx.tree_at(lambda n: n.level, noise, np.fmax(noise.level, FINEST * rms) + 0 * noise.level)
+    return rms
 
 
 def _of_record(model: LumpedModel, record: Record, others: list[Record]) -> Noise:
