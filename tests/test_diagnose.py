@@ -245,3 +245,10 @@ def test_an_unstable_model_is_judged_by_windows():
     found = diagnose(model, record(u, exact(u)[:, :1], kinds=((0, "acceleration"),)))
     assert found.examination.before.windowed
     assert any("unstable" in x for x in found.warnings)
+    assert found.examination.locations is not None
+    assert all(np.isfinite(x.force).all() for x in found.examination.locations.maps)
+    assert found.causes is not None
+    (seconds,) = found.causes.before[0].windows
+    told = f"On samples that were not used, in windows of {seconds:.2g} s, the gap falls"
+    assert told in found.summary[1]
+    assert f"held-out samples, in windows of {seconds:.2g} s (NRMSE)" in diagnosis_page(found)

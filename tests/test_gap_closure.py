@@ -167,7 +167,9 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     data = record(u, y[:, :2], kinds=((0, ""), (1, "")))
     noise = known(np.append(level[:2], np.nan))
     found = left_of(refitted(frozen, Hypothesis()), frozen, [data], [3 * SAMPLES], windowed=windowed)
-    (left,), (measured,) = found
+    (left,), (measured,), windows = found
+    length = of.blocks[0].y.shape[1] - of.blocks[0].lead
+    assert windows == ((pytest.approx(length * DT),) if windowed else ())
     assert left.shape == measured.shape == (SAMPLES, 3)
     assert np.isnan(left[:, 2]).all()
     np.testing.assert_array_equal(measured[:, :2], y[-SAMPLES:, :2])

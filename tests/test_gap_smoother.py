@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.linalg
 
 from jaxsid.gap.smoother import foretold_covariance, latent_model, smooth
@@ -62,6 +63,20 @@ def test_covariance_solves_the_riccati_equation_of_scipy():
     expected = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
     P = np.asarray(foretold_covariance(found))
     assert np.linalg.norm(P - expected) < 1e-7 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("plain", [PLAIN, [[0.0, 1.0], [4.0, -0.5]]], ids=["stable", "unstable"])
+def test_covariance_of_one_accelerometer_that_hardly_has_noise(plain):
+    plain = np.array(plain)
+    given = (plain, PUSH, plain[1:], PUSH[1:], SIZE, RATE, np.array([1e-10]), DT)
+    found = latent_model(*(jnp.asarray(x) for x in given))
+    A, Q, C, R = (np.asarray(x) for x in found)
+    expected = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    P = np.asarray(foretold_covariance(found))
+    unit = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(P / unit / unit[:, None], expected / unit / unit[:, None], atol=1e-6)
+    gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+    assert np.abs(np.linalg.eigvals(A @ (np.eye(4) - gain @ C))).max() < 1
 
 
 def test_smoothing_is_that_of_a_plain_recursion_with_the_full_covariances():

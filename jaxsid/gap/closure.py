@@ -30,10 +30,13 @@ class Left(NamedTuple):
     Attributes:
         left: (samples, outputs) of every record, NaN for absent sensors.
         measured: likewise.
+        windows: of every record the seconds after which the model begins anew, from the state that suits it; none where
+            it runs on.
     """
 
     left: tuple[Float[np.ndarray, "samples outputs"], ...]
     measured: tuple[Float[np.ndarray, "samples outputs"], ...]
+    windows: tuple[float, ...] = ()
 
 
 class Closure(NamedTuple):
@@ -125,7 +128,8 @@ def left_of(
         mask = np.where(seen, 0.0, np.nan)
         left.append(rest + mask)
         measured.append(y + mask)
-    return Left(tuple(left), tuple(measured))
+    windows = tuple(_length(bench) * float(r.dt) for r in records) if windowed else ()
+    return Left(tuple(left), tuple(measured), windows)
 
 
 def left_before(found: Refit, bench: Bench) -> tuple[Float[np.ndarray, "..."], ...]:

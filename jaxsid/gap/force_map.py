@@ -18,6 +18,8 @@ from jaxsid.gap.spectra import Spectra, in_time
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 
+UNSEEN = 1e-9  # of the largest response to a force: one that is rounding
+LARGEST = 10.0  # steady part of a force, which no sensor sees, next to the rms of the rest
 ABSENT = 1e6  # noise of a sensor that a record lacks, next to that of the others
 
 
@@ -97,8 +99,10 @@ def _smoothed(
 ) -> tuple[Float[Array, "samples 3"], Array]:
     """Force, displacement and velocity; the force's standard deviation."""
     transfer = spectra.forced @ joint + sensor
-    # a line on a pole tells nothing: left out here, and a free body's steady force is that of its balance
-    used = spectra.weight > 0
+    # a line on a pole tells nothing: left out here, and a free body's steady force is that of its balance; nor does
+    # one that no sensor sees, as accelerometers do not see a steady force
+    size_seen = jnp.sqrt((jnp.abs(transfer) ** 2).sum(axis=1))
+    used = (spectra.weight > 0) & (size_seen > UNSEEN * size_seen.max())
     force = jnp.where(used, made.force, 0.0)
     y = in_time(spectra, jnp.where(used[:, None], made.left + transfer * force[:, None], 0.0))
     moved = (spectra.forced_states @ joint) * force[:, None]
@@ -108,13 +112,19 @@ def _smoothed(
     found = smooth(latent, y, start)
     q, v = jnp.split(in_time(spectra, made.motion.states), 2, axis=1)
     n = len(start) - 2
-    steady = jnp.where(used[0], 0.0, _steady_force(spectra, made, joint)) / np.sqrt(spectra.samples)
+    rest = jnp.sqrt(2 * (jnp.abs(force) ** 2).sum())
+    steady = jnp.where(used[0], 0.0, _steady_force(spectra, made, joint, LARGEST * rest)) / np.sqrt(
+        spectra.samples
+    )
     signals = jnp.stack([found.state[:, n] + steady, q @ joint, v @ joint], axis=1)
     return signals, jnp.sqrt(jnp.maximum(found.covariance[n, n], 0.0))
 
 
-def _steady_force(spectra: Spectra, made: Explained, joint: Array) -> Array:
-    """Line 0 of a force that acts on free bodies, from the balance of impulses; the shapes' own where it does not."""
+def _steady_force(spectra: Spectra, made: Explained, joint: Array, most: Array) -> Array:
+    """Line 0 of a force that acts on free bodies, from the balance of impulses; the shapes' own where it does not.
+
+    None where that is absurd beside the rest of the force: then the shapes tell nothing of it either.
+    """
     linear, motion = spectra.linear, made.motion
     v = motion.states[0, len(joint) :].real
     missing = linear.mass @ motion.accelerations[0].real + linear.damping @ v
@@ -123,4 +133,5 @@ def _steady_force(spectra: Spectra, made: Explained, joint: Array) -> Array:
     square = along @ joint
     balanced = square > 1e-9 * (joint @ joint)
     found = along @ missing / jnp.where(balanced, square, 1.0)
-    return jnp.where(balanced, found, made.force[0].real)
+    own = made.force[0].real
+    return jnp.where(balanced, found, jnp.where(jnp.abs(own) > most, 0.0, own))

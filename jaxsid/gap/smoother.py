@@ -89,6 +89,10 @@ def latent_model(
 def foretold_covariance(model: Latent) -> Float[Array, "m m"]:
     """P = A (P - P C' (C P C' + R)^-1 C P) A' + Q, by doubling.
 
+    What one step adds is taken into the noise first: P = X + Q, where X solves the same equation with R + C Q C' in
+    place of R, A (I - L C) of A and A (Q - L C Q) A' of Q, L = Q C' (R + C Q C')^-1. Its first step divides by that,
+    not by R, which loses all digits where sensors hardly have noise.
+
     Args:
         model: whose states are seen or die out.
 
@@ -101,8 +105,13 @@ def foretold_covariance(model: Latent) -> Float[Array, "m m"]:
         inverse = jnp.linalg.inv(eye + G @ P)
         return F @ inverse @ F, G + F @ inverse @ G @ F.T, P + F.T @ P @ inverse @ F
 
-    start = model.A.T, model.C.T @ jnp.linalg.solve(model.R, model.C), model.Q
-    P = lax.fori_loop(0, DOUBLINGS, double, start)[2]
+    A, Q, C, R = model
+    S = R + C @ Q @ C.T
+    gain = jnp.linalg.solve(S, C @ Q).T
+    rest = eye - gain @ C
+    filtered = rest @ Q @ rest.T + gain @ R @ gain.T
+    start = (A @ rest).T, C.T @ jnp.linalg.solve(S, C), A @ filtered @ A.T
+    P = lax.fori_loop(0, DOUBLINGS, double, start)[2] + Q
     return (P + P.T) / 2
 
 

@@ -69,6 +69,16 @@ def named(x: Explanation) -> str:
     return f"{kind_words(x.kind)} {place_words(x.place)}"
 
 
+def windows_words(causes: Causes | None) -> str:
+    """How held-out samples were judged, where a model that drifts does not run on: ", in windows of 0.13 s", or "".
+
+    Args:
+        causes: of a diagnosis.
+    """
+    each = () if causes is None else dict.fromkeys(causes.before[0].windows)
+    return f", in windows of {' or '.join(f'{x:.2g}' for x in each)} s" if each else ""
+
+
 def percent(x: float) -> str:
     """With two digits."""
     return f"{float(f'{100 * x:.2g}'):g} %"
@@ -92,9 +102,10 @@ def summary(found: Found) -> tuple[str, str]:
             return told, "Its numbers are off by no more than they may be; refitted it leaves noise alone."
         return told, "Nothing that the model lacks is to be seen in these records."
     closure = causes.closures[-1]
+    anew = f"{windows}," if (windows := windows_words(causes)) else ""
     shrinks = (
-        f"On samples that were not used the gap falls from {percent(closure.before)} to {percent(closure.after)}; "
-        f"noise alone leaves {causes.most}{percent(closure.noise_floor)}."
+        f"On samples that were not used{anew} the gap falls from {percent(closure.before)} to "
+        f"{percent(closure.after)}; noise alone leaves {causes.most}{percent(closure.noise_floor)}."
     )
     if found.verdict == "unknown":
         likely = found.examination.locations

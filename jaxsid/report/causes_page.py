@@ -8,7 +8,7 @@ from jaxsid.gap.closure import Closure, Left
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import elements_by_key
 from jaxsid.gap.ranking import key_of
-from jaxsid.gap.words import kind_words, named, place_words
+from jaxsid.gap.words import kind_words, named, place_words, windows_words
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.physical.elements import element_matrices
 from jaxsid.report.frame import Block, Card, Cell, Gallery, Picture, Section, Table, Text, picture
@@ -52,8 +52,9 @@ def closure_cards(found: Diagnosis) -> tuple[Card, ...]:
         remark = "of this explanation, of all that were tried"
     # with less noise than its bound less would be explained
     supposed = ", if noise is as large as it may be" if _most(found) else ""
+    samples = f"nominal model, held-out samples{windows_words(found.causes)} (NRMSE)"
     return (
-        Card("Gap before", misfit(closure.before), "nominal model, held-out samples (NRMSE)"),
+        Card("Gap before", misfit(closure.before), samples),
         Card(
             "Gap after",
             misfit(closure.after),
@@ -224,11 +225,13 @@ def closure_section(found: Diagnosis) -> Section:
     for i, (x, step) in enumerate(zip(causes.selected, causes.closures, strict=False)):
         said = Cell(f"{'with' if i == 0 else 'and'} {kind_words(x.kind)}", place_words(x.place))
         rows.append(_closure_row(said, step.after, step.by_sensor, names))
+    anew = windows_words(causes)
+    anew = f"{anew}, each from the state that suits it best" if anew else ""
     floor = f"noise alone, {causes.most}".rstrip(", ")
     rows.append(_closure_row(floor, closure.noise_floor, closure.noise_by_sensor, names))
     low, high = closure.ci95
     note = (
-        f"NRMSE on the last {_held_out(found)} of every record. Of the nominal model's gap above the noise "
+        f"NRMSE on the last {_held_out(found)} of every record{anew}. Of the nominal model's gap above the noise "
         f"{percent(closure.fraction)} is gone (95 %: {percent(low)} to {percent(high)}); {_next_to_linear(closure)}. "
         "Explained = 1 − √((a² − n²) / (b² − n²)), with b "  # noqa: RUF001
         "before, a after and n the noise."

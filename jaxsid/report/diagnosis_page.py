@@ -210,6 +210,11 @@ def _where(found: Diagnosis) -> Section:
         "their tolerance beside it. Across: what no force at this place could explain, in noise; about 1 at the right "
         "one."
     )
+    if any(len(x.together) > 1 for x in places.ranked[:PLACES]):
+        note += (
+            " Where places are not told apart, what bears one force or explains these records alike, the probability "
+            "of one against another rests on the shape of its force alone."
+        )
     table = Table(("Place", "Probability", "Log evidence", "Across", "Not told apart from"), rows, "", note)
     figure = picture(
         place_figure(places), "Filled: the most probable place, with those not told apart from it."
