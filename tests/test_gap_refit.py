@@ -5,7 +5,20 @@ import numpy as np
 import pytest
 from effects_truth import GROUND, Chain, Truth
 from gap_bench import PART, POLE, bench, colored, known, stepped, whitened, windows_of
-from gap_helpers import BODIES, DAMPING, DT, JOINT, MASS, SAMPLES, STIFFNESS, chain, drive, exact, record
+from gap_helpers import (
+    BODIES,
+    DAMPING,
+    DT,
+    JOINT,
+    MASS,
+    SAMPLES,
+    SENSED,
+    STIFFNESS,
+    chain,
+    drive,
+    exact,
+    record,
+)
 from gap_helpers import with_effect as truth
 from scipy.linalg import expm
 from scipy.optimize import least_squares
@@ -482,11 +495,34 @@ def test_what_a_search_expects_is_what_a_full_step_brings():
         move, moves = _step(at, prior, links, damping)
         new = _evaluated(*given, begin + move, [a + b for a, b in zip(states, moves, strict=True)], 1)
         costs.append(new.cost)
-        assert _expected(new, prior, links) == pytest.approx(
+        assert sum(_expected(new, prior, links)) == pytest.approx(
             new.cost - costs[0], rel=0.02, abs=1e-3 * at.cost
         )
-    assert _expected(at, prior, links) == pytest.approx(at.cost - costs[0], rel=0.02)
+    assert sum(_expected(at, prior, links)) == pytest.approx(at.cost - costs[0], rel=0.02)
     assert at.cost > costs[1] > costs[0]
+
+
+@pytest.mark.parametrize("off", [0.0, 0.01])
+def test_a_search_does_not_stop_along_a_valley(off):
+    """One input, one sensor: all numbers and the gain may move together, and all but their tolerance is indifferent."""
+    u, kinds = drive(), SENSED[:1]
+    y, model = 1.04 * exact(u, kinds), chain(kinds)
+    level = 1e-5 * y.std(axis=0)
+    y = y + level * np.random.default_rng(1).standard_normal(y.shape)
+    noise = Noise(level, np.array([[1.0]]), 1e4, "periods")
+    three = bench(np.tile(y, (1, 3)), np.tile(level, 3))
+    length = window_length(slowest_rate(model), DT, SAMPLES)
+    of = three._replace(
+        model=model,
+        blocks=blocks_of(model, [record(u, y, kinds)], [noise], length),
+        moved=(three.moved[0]._replace(y=y),),
+        tolerance=np.repeat([0.005, 0.05, 0.005], 3),
+    )
+    gain = effect("sensor_gain", "s0", factor=1.04 * (1 + off))
+    found = refitted(of, Hypothesis((gain,)), changes=np.full(9, off))
+    assert found.fit.settled
+    np.testing.assert_allclose(found.fit.theta[:9], 0, atol=1e-3)
+    assert float(found.hypothesis.effects[0].parameters["factor"]) == pytest.approx(1.04, rel=1e-3)
 
 
 def test_deviations_come_from_windows_where_more_than_noise_is_left():

@@ -18,7 +18,8 @@ STEPS = 25  # of the search
 GAIN = 0.05  # of the cost, in mean squares of what is left: where no more is to be had the search ends
 PART = 1e-5  # or this part of it
 DAMPING = 1e-3  # to begin with
-MOST_DAMPING = 1e8
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e8
+EASED = 1e3  # factor by which damping falls where it held a step back
 IDLE = 2  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
@@ -109,14 +110,19 @@ def fitted(
         less = at.cost - found.cost
         if less > 0:
             # what has just failed with less damping would fail again
-            at, damping = found, damping if growth > SLOWER else max(damping / 5, 1e-9)
+            at, damping = found, damping if growth > SLOWER else max(damping / 5, LEAST_DAMPING)
             growth = SLOWER
             little = gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost)
             idle = idle + 1 if less < little else 0
-            # a step held back by its damping brings little even far from the end
-            if idle and (idle == IDLE or _expected(at, prior, links) < little):
-                settled = True
-                break
+            if idle:
+                # a step held back by its damping brings little even far from the end
+                by_unknowns, by_states = _expected(at, prior, links)
+                if idle == IDLE or by_unknowns + by_states < little:
+                    settled = True
+                    break
+                if by_unknowns > little:
+                    # along a valley of the unknowns, which some records hardly tell apart
+                    damping = max(damping / EASED, LEAST_DAMPING)
         else:
             damping, growth = damping * growth, SLOWER * growth
             if damping > MOST_DAMPING:
@@ -270,13 +276,14 @@ def _step(at: _At, prior: Prior, links: Links, damping: float) -> tuple[np.ndarr
     return move, np.split(moves, np.cumsum([len(x) for x in at.states])[:-1])
 
 
-def _expected(at: _At, prior: Prior, links: Links) -> float:
-    """How much less the cost would be at its lowest, were it a parabola."""
+def _expected(at: _At, prior: Prior, links: Links) -> tuple[float, float]:
+    """How much less the cost would be at its lowest, were it a parabola: by the unknowns, and by the states alone."""
     p, normal = len(at.theta), _normal(at, prior, links)
     reduced, back, _ = normal.reduced()
     slope = reduced[:, p]
-    of_states = (normal.slopes * back[:, :, p]).sum()
-    return float(0.5 * (slope @ _solved(reduced[:, :p], slope[:, None])[:, 0] + of_states))
+    by_states = (normal.slopes * back[:, :, p]).sum()
+    by_unknowns = slope @ _solved(reduced[:, :p], slope[:, None])[:, 0]
+    return 0.5 * float(by_unknowns), 0.5 * float(by_states)
 
 
 def _led(at: _At, prior: Prior, links: Links) -> list[np.ndarray]:
