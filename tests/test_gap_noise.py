@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from jaxsid.checks import InputError
 from jaxsid.gap.decay import without_decays
 from jaxsid.gap.noise import Noise, no_louder, noise_of, period_of, quiet_part, quieter, residual_noise
+from jaxsid.impulse.whitening import whitening_filter
 
 LEVEL = 0.05
 
@@ -120,6 +121,34 @@ def test_lines_have_the_deviation_that_is_said():
     whitened = np.abs(lines / noise.deviation(omega, 1.0)) ** 2
     thirds = [x.mean() for x in np.array_split(whitened, 6)]
     np.testing.assert_allclose(thirds, 1.0, atol=0.1)
+
+
+def comes_and_goes(what, samples):
+    """What a law may leave: a sine whose frequency goes by steps, one at the end alone, a burst."""
+    t = np.arange(samples)
+    sine = np.sin(2 * np.pi * np.cumsum(np.repeat(np.linspace(0.01, 0.2, 12), -(-samples // 12))[:samples]))
+    burst = np.exp(-(((t - samples / 2) / 200) ** 2)) * np.random.default_rng(9).standard_normal(samples)
+    return {"steps": sine, "slight": 0.1 * sine, "late": sine * (t > 0.83 * samples), "burst": burst}[what]
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+@pytest.mark.parametrize("what", ["steps", "slight", "late", "burst"])
+def test_what_comes_and_goes_is_no_noise(what, pole):
+    noise = 0.02 * lfilter([1.0], [1.0, -pole], np.random.default_rng(4).standard_normal(6000))
+    left = noise + comes_and_goes(what, 6000)
+    found = residual_noise(left[:, None])
+    np.testing.assert_allclose(found.rms() / noise.std(), 1, atol=0.15)
+    np.testing.assert_allclose(found.level / 0.02, 1, atol=0.15)
+
+
+@pytest.mark.parametrize("shape", [(1, 800), (1, 6000), (30, 128)])
+@pytest.mark.parametrize("pole", [0.0, 0.6, 0.95])
+def test_noise_that_is_there_throughout_is_all_of_what_is_left(pole, shape):
+    for seed in range(20):
+        white = np.random.default_rng(seed).standard_normal((shape[0], shape[1] + 200))
+        left = lfilter([1.0], [1.0, -pole], white)[:, 200:, None]
+        found = residual_noise(left)
+        np.testing.assert_array_equal(found.taps[0], whitening_filter(left[:, :, 0] - left.mean()))
 
 
 @pytest.mark.parametrize("period", [256, 300])

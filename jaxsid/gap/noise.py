@@ -10,6 +10,9 @@ from collections.abc import Iterable, Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+from scipy.stats import gamma
 
 from jaxsid.checks import require
 from jaxsid.gap.decay import without_decays
@@ -27,6 +30,11 @@ LARGE_PART = 0.2  # of a sensor's signal, from which on it is that
 SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
+STRETCHES = 8  # of time, in the quietest of which a band shows what is there throughout
+STEADY = (
+    0.5  # part of the power of what is left, that if less is there throughout it alone is taken for noise
+)
+SHARED = 1.5  # lines that share what one shows, with a window of Hann
 FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
 
@@ -245,13 +253,58 @@ def _fitted(signals: Float[np.ndarray, "segments samples outputs"], source: str)
 
 
 def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> Noise:
-    """Level and colour of what a model left, taken for noise as a whole.
+    """Level and colour of what a model left, taken for noise: all of it, or what of it is there throughout.
+
+    What a law leaves comes and goes with the motion, as with the frequency of a stepped sine, or with impacts. Noise
+    does not: it is no more, in any band, than where that is quietest.
 
     Args:
-        signals: what it left, in one piece or several of equal length; NaN for absent sensors.
+        signals: what it left, in one piece or several of equal length, in the order of time; NaN for absent sensors.
+
+    Source: R. Martin, IEEE Trans. Speech and Audio Processing 9 (2001), for noise by its least power in time.
     """
-    noise = _fitted(signals if signals.ndim == 3 else signals[None], SOURCES[3])
-    return Noise(noise.level, noise.taps, 0.0, SOURCES[3])
+    signals = signals if signals.ndim == 3 else signals[None]
+    noise = _fitted(signals, SOURCES[3])
+    level, taps = noise.level.copy(), noise.taps.copy()
+    for j in np.flatnonzero(np.isfinite(level)):
+        own = signals[:, :, j] - signals[:, :, j].mean()
+        # where what is there throughout is white all bands tell as much
+        colour, _ = _filter_of(_steady_power(own)[1])
+        whole, steady = _steady_power(np.asarray(lfilter(colour, 1.0, own))[:, MOST:])
+        if steady.sum() < STEADY * whole.sum():
+            response = np.fft.rfft(colour, 2 * (len(steady) - 1))
+            taps[j], level[j] = _filter_of(steady / np.abs(response) ** 2)
+    return Noise(level, taps, 0.0, SOURCES[3])
+
+
+def _steady_power(
+    signal: Float[np.ndarray, "segments samples"],
+) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Power by frequency: the mean over time, and the least, in bands, of as many stretches as are compared."""
+    count, length = signal.shape
+    each = 1 if count >= STRETCHES else -(-STRETCHES // count)
+    even = length // each // 2 * 2
+    pieces = signal[:, : each * even].reshape(count * each, even)
+    window = np.hanning(even)
+    lines = np.abs(np.fft.rfft(pieces * window)) ** 2 / max((window**2).sum(), np.finfo(float).tiny)
+    whole = lines.mean(axis=0)
+    if len(whole) < 2 * BANDS:
+        return whole, whole
+    stretches = np.stack([x.mean(axis=0) for x in np.array_split(lines, STRETCHES)])
+    steady = np.empty_like(whole)
+    for band in np.array_split(np.arange(len(whole)), BANDS):
+        # the least of so many averages of squares of normal numbers lies low; a window shares them among lines
+        told = len(lines) // STRETCHES * len(band) / SHARED
+        low = gamma.ppf(1 - 0.5 ** (1 / STRETCHES), told) / told
+        steady[band] = stretches[:, band].mean(axis=1).min(axis=0) / low
+    return whole, steady
+
+
+def _filter_of(power: Float[np.ndarray, " lines"]) -> tuple[Float[np.ndarray, " taps"], float]:
+    """The filter that makes noise of this power by frequency white, and the deviation of what it leaves."""
+    covariance = np.fft.irfft(power)[: MOST + 1]
+    taps = np.concatenate([[1.0], solve_toeplitz(covariance[:MOST], -covariance[1:])])
+    return taps, float(np.sqrt(max(taps @ covariance, np.finfo(float).tiny)))
 
 
 def quieter(guess: Noise, left: Noise, found: float = 1.0) -> Noise:
