@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gap_helpers import DT, JOINT, chain, drive, noisy, record, with_effect
 from scipy.linalg import expm
-from test_gap_causes import B12, BENCH, candidate, ranking, refit
+from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
 from jaxsid.gap import causes
 from jaxsid.gap.causes import _followed, _Found
@@ -130,34 +130,58 @@ def test_held_out_samples_are_followed_as_closely(snaps, fitted):
     assert (left["linear"] > 5 * left["law"]).all()
 
 
-@pytest.mark.parametrize(
-    ("selected", "parts", "left", "taken"),
-    [
-        (1, True, 1.5, True),
-        (1, False, 1.5, False),  # usual windows do for the law
-        (1, True, 2.5, False),  # too much is left
-        (0, True, 1.5, False),  # nothing is worth it
-    ],
-)
-def test_it_is_taken_where_neighbours_part(monkeypatch, selected, parts, left, taken):
+def followed(monkeypatch, rounds, parts, place=B12):
+    """What comes of rounds, each so many laws taken and so much left by the best one, and what they began with."""
     look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
     origin = _Found(BENCH, look, (), (), None)
     law = ranking(0.0, kinds=[("cogging_ripple", B12)])
-    law = law._replace(ranked=(law.ranked[0]._replace(left=left),))
-    at = origin._replace(rounds=(law,), selected=law.ranked[:selected], before=refit(0.0))
-    tried = []
+    ends, begun = [], []
+    for selected, left in rounds:
+        last = law._replace(ranked=(law.ranked[0]._replace(left=left),))
+        ends.append(origin._replace(rounds=(last,), selected=last.ranked[:selected], before=refit(0.0)))
+
+    def further(begin, here, *_):
+        begun.append((begin, tuple(here)))
+        return ends[len(begun) - 1]
+
     monkeypatch.setattr(causes, "at_likeliest", lambda look, candidates: tuple(candidates))
-    place = [Place("between", ("b1", "b2"))]
-    monkeypatch.setattr(causes, "likeliest", lambda scored: place[-1])
+    monkeypatch.setattr(causes, "likeliest", lambda scored: Place(*next(iter(place.items()))))
     monkeypatch.setattr(causes, "closely", lambda *_: BENCH._replace(loose=0.1))
-    monkeypatch.setattr(causes, "_further", lambda begin, here, *_: tried.extend(here) or at)
+    monkeypatch.setattr(causes, "begun_near", lambda bench, scored: bench._replace(jump=0.2))
+    monkeypatch.setattr(causes, "again", lambda law, refit: candidate("cogging_ripple", B23))
+    monkeypatch.setattr(causes, "_further", further)
     monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
     silent = lambda text: None  # noqa: E731
-    found = _followed(origin, candidates, BENCH.model, (), silent)
-    assert len(tried) == causes.CLOSELY
-    assert found == ((at, origin._replace(bench=BENCH._replace(loose=0.1))) if taken else None)
-    nowhere = origin._replace(look=look._replace(scored=None))
-    assert _followed(nowhere, candidates, BENCH.model, (), silent) is None
-    place.append(Place("input", ("drive",)))
-    assert _followed(origin, candidates, BENCH.model, (), silent) is None
+    return origin, ends, begun, _followed(origin, candidates, BENCH.model, (), silent)
+
+
+@pytest.mark.parametrize(
+    ("selected", "left", "taken"),
+    [
+        (1, 1.5, True),
+        (1, 2.5, False),  # too much is left
+        (0, 1.5, False),  # nothing is worth it
+    ],
+)
+def test_it_is_taken_where_neighbours_part(monkeypatch, selected, left, taken):
+    origin, ends, begun, found = followed(monkeypatch, [(selected, left)], True)
+    (begin, here) = begun[0]
+    assert len(begun) == 1
+    assert len(here) == causes.CLOSELY
+    assert begin == origin._replace(bench=BENCH._replace(loose=0.1))
+    assert found == ((ends[0], begin) if taken else None)
+
+
+@pytest.mark.parametrize(("selected", "left", "taken"), [(1, 1.5, True), (1, 2.5, False), (0, 1.5, False)])
+def test_where_they_hardly_part_its_law_is_tried_in_usual_windows(monkeypatch, selected, left, taken):
+    origin, ends, begun, found = followed(monkeypatch, [(1, 1.5), (selected, left)], False)
+    begin, tried = begun[1]
+    assert begin == origin._replace(bench=BENCH._replace(jump=0.2))
+    assert tried[0].place == B23
+    assert len(tried) == 10
+    assert found == ((ends[1], begin) if taken else None)
+
+
+def test_what_acts_between_no_bodies_is_not_followed(monkeypatch):
+    assert followed(monkeypatch, [], True, {"input": ("drive",)})[3] is None

@@ -185,21 +185,21 @@ def test_laws_where_what_is_left_most_probably_arises_are_tried_early(monkeypatc
     elsewhere = [candidate(k, B12) for k in LAWS] + [candidate(k, B13) for k in LAWS]
     here = [candidate("stribeck_friction", B23), candidate("missing_mode", {"body": "b2"})]
     first = [candidate("cogging_ripple", B12)]
-    monkeypatch.setattr(causes, "candidates_of", lambda look: (*elsewhere, *here))
+    monkeypatch.setattr(look_of, "candidates_of", lambda look: (*elsewhere, *here))
     monkeypatch.setattr(look_of, "likeliest", lambda scored: Place("between", B23["between"]))
     look = Look(*map(cast, [Any] * 3, ("fit", "null", "scored")))
-    found = causes._further_candidates(look, first)
+    found = look_of.further_candidates(look, first)
     assert {key_of(c.kind, c.place) for c in found} == {
         key_of(c.kind, c.place) for c in (*elsewhere, *here, *first)
     }
     assert found[:4] == (elsewhere[0], here[0], elsewhere[1], first[0])
-    assert causes._further_candidates(look._replace(scored=None), first)[:3] == (
+    assert look_of.further_candidates(look._replace(scored=None), first)[:3] == (
         elsewhere[0],
         elsewhere[1],
         first[0],
     )
-    monkeypatch.setattr(causes, "candidates_of", lambda look: ())
-    assert causes._further_candidates(look, first) == ()
+    monkeypatch.setattr(look_of, "candidates_of", lambda look: ())
+    assert look_of.further_candidates(look, first) == ()
 
 
 # where nothing more explains what is left
@@ -230,7 +230,7 @@ def searched(monkeypatch):
 
         monkeypatch.setattr(_Found, "taken", taken)
         monkeypatch.setattr(causes, "looked", lambda *_: look)
-        monkeypatch.setattr(causes, "_further_candidates", lambda look, first: ())
+        monkeypatch.setattr(causes, "further_candidates", lambda look, first: ())
         monkeypatch.setattr(causes, "_further", further)
         return at, _otherwise(at, origin, (), BENCH.model, (), silent)
 

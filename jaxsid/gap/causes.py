@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxsid.gap.closely import PARTED, closely, motions_to_begin, parting, tightened
+from jaxsid.gap.closely import PARTED, begun_near, closely, motions_to_begin, parting, tightened
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
@@ -28,7 +27,7 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored, likeliest
-from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_of, looked, varied
+from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_of, further_candidates, looked
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
@@ -259,7 +258,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         at = _reconsidered(at, model, seen, say)
         if len(at.selected) >= most:
             break
-        candidates = _further_candidates(at.look, first)
+        candidates = further_candidates(at.look, first)
     return at
 
 
@@ -270,7 +269,10 @@ def _followed(
     seen: Sequence[Record],
     say: Callable[[str], None],
 ) -> tuple[_Found, _Found] | None:
-    """The first effect in windows of a few samples, with it and without; None where usual ones do, or none explains."""
+    """The first effect as windows of a few samples tell it, with it and without; None where none explains.
+
+    Where its neighbouring motions hardly part usual windows do, from the motion and the law that were so found.
+    """
     look, here = origin.look, at_likeliest(origin.look, candidates)[:CLOSELY]
     if look.scored is None or not here or "between" not in likeliest(look.scored).as_dict():
         return None
@@ -279,17 +281,12 @@ def _followed(
     at = _further(begin, here, FIRST, model, seen, say)
     if not at.selected or loud(at.rounds[-1]):
         return None
-    return (at, begin) if parting(at.bench, at.selected[-1].refit) > PARTED else None
-
-
-def _further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """What now comes first, in turn with what does where it most probably arises, and what came next to the first.
-
-    Nothing where nothing is left.
-    """
-    now = varied(candidates_of(look))
-    streams = (now[::2], at_likeliest(look, now), now[1::2], varied(first)) if now else ()
-    return tuple(c for four in zip_longest(*streams) for c in four if c is not None)
+    law = at.selected[-1]
+    if parting(at.bench, law.refit) > PARTED:
+        return at, begin
+    begin = origin._replace(bench=begun_near(origin.bench, look.scored))
+    at = _further(begin, (again(law, law.refit), *candidates), FIRST, model, seen, say)
+    return (at, begin) if at.selected and not loud(at.rounds[-1]) else None
 
 
 def _elsewhere(
@@ -308,7 +305,7 @@ def _elsewhere(
     at = _left(origin.taken(anew), model, seen)
     if at.look.clear:
         return at
-    return _further(at, _further_candidates(at.look, first), FURTHER, model, seen, say)
+    return _further(at, further_candidates(at.look, first), FURTHER, model, seen, say)
 
 
 def _otherwise(
@@ -329,7 +326,7 @@ def _otherwise(
     say(f"{y.kind} in place of {best.kind}")
     others = tuple(x for x in ranking.ranked if x is not y)
     other = _left(origin.taken(ranking._replace(ranked=(y, *others))), model, seen)
-    further = _further(other, _further_candidates(other.look, first), FURTHER, model, seen, say)
+    further = _further(other, further_candidates(other.look, first), FURTHER, model, seen, say)
     return further if len(further.selected) > len(at.selected) else at
 
 

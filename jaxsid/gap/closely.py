@@ -61,7 +61,7 @@ def closely(
     """
     bench = bench_of(model, records, list(map(_white, noises)), refit, length=LENGTH)
     play = PLAY * noise_part(bench)
-    return bench._replace(states=states_at(bench.blocks, implied(found)), jump=play, loose=play)
+    return begun_near(bench, found)._replace(jump=play, loose=play)
 
 
 def followed_closely(bench: Bench) -> bool:
@@ -101,6 +101,16 @@ def implied(found: Scored) -> list[Float[np.ndarray, "samples n"]]:
         np.asarray(in_time(s.spectra, x.motion.states[row]))
         for s, x in zip(found.settings, found.found.explained, strict=True)
     ]
+
+
+def begun_near(bench: Bench, found: Scored) -> Bench:
+    """The bench with the motion to begin with that a force at the most probable place implies.
+
+    Args:
+        bench: records.
+        found: places, of the records.
+    """
+    return bench._replace(states=states_at(bench.blocks, implied(found)))
 
 
 def motions_to_begin(

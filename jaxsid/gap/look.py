@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -101,6 +102,20 @@ def at_likeliest(look: Look, candidates: Sequence[Candidate]) -> tuple[Candidate
         return ()
     place = ends_of(likeliest(look.scored).as_dict())
     return tuple(c for c in candidates if ends_of(c.place) == place)
+
+
+def further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """What now comes first, in turn with what does where it most probably arises, and what came next to the first.
+
+    Nothing where nothing is left.
+
+    Args:
+        look: of what is left now.
+        first: candidates of the first look.
+    """
+    now = varied(candidates_of(look))
+    streams = (now[::2], at_likeliest(look, now), now[1::2], varied(first)) if now else ()
+    return tuple(c for four in zip_longest(*streams) for c in four if c is not None)
 
 
 def varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
