@@ -149,6 +149,7 @@ def followed(monkeypatch, rounds, parts, place=B12):
     monkeypatch.setattr(causes, "closely", lambda *_: BENCH._replace(loose=0.1))
     monkeypatch.setattr(causes, "begun_near", lambda bench, scored: bench._replace(jump=0.2))
     monkeypatch.setattr(causes, "again", lambda law, refit: candidate("cogging_ripple", B23))
+    monkeypatch.setattr(causes, "changes_of", lambda found, bench: np.arange(9.0))
     monkeypatch.setattr(causes, "_further", further)
     monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
@@ -179,6 +180,7 @@ def test_where_they_hardly_part_its_law_is_tried_in_usual_windows(monkeypatch, s
     begin, tried = begun[1]
     assert begin == origin._replace(bench=BENCH._replace(jump=0.2))
     assert tried[0].place == B23
+    np.testing.assert_array_equal(tried[0].changes, np.arange(9.0))
     assert len(tried) == 10
     assert found == ((ends[1], begin) if taken else None)
 

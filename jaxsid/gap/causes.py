@@ -285,7 +285,8 @@ def _followed(
     if parting(at.bench, law.refit) > PARTED:
         return at, begin
     begin = origin._replace(bench=begun_near(origin.bench, look.scored))
-    at = _further(begin, (again(law, law.refit), *candidates), FIRST, model, seen, say)
+    own = again(law, law.refit)._replace(changes=changes_of(law.refit, at.bench))
+    at = _further(begin, (own, *candidates), FIRST, model, seen, say)
     return (at, begin) if at.selected and not loud(at.rounds[-1]) else None
 
 
