@@ -27,7 +27,15 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored, likeliest
-from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_of, further_candidates, looked
+from jaxsid.gap.look import (
+    Look,
+    at_likeliest,
+    attached_candidates,
+    candidates_of,
+    further_candidates,
+    looked,
+    varied,
+)
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
