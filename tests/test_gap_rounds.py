@@ -188,18 +188,18 @@ def test_laws_where_what_is_left_most_probably_arises_are_tried_early(monkeypatc
     monkeypatch.setattr(look_of, "candidates_of", lambda look: (*elsewhere, *here))
     monkeypatch.setattr(look_of, "likeliest", lambda scored: Place("between", B23["between"]))
     look = Look(*map(cast, [Any] * 3, ("fit", "null", "scored")))
-    found = look_of.further_candidates(look, first)
+    found = look_of.to_try(look, first)
     assert {key_of(c.kind, c.place) for c in found} == {
         key_of(c.kind, c.place) for c in (*elsewhere, *here, *first)
     }
     assert found[:4] == (elsewhere[0], here[0], elsewhere[1], first[0])
-    assert look_of.further_candidates(look._replace(scored=None), first)[:3] == (
+    assert look_of.to_try(look._replace(scored=None), first)[:3] == (
         elsewhere[0],
         elsewhere[1],
         first[0],
     )
     monkeypatch.setattr(look_of, "candidates_of", lambda look: ())
-    assert look_of.further_candidates(look, first) == ()
+    assert look_of.to_try(look, first) == ()
 
 
 # where nothing more explains what is left
@@ -230,7 +230,7 @@ def searched(monkeypatch):
 
         monkeypatch.setattr(_Found, "taken", taken)
         monkeypatch.setattr(causes, "looked", lambda *_: look)
-        monkeypatch.setattr(causes, "further_candidates", lambda look, first: ())
+        monkeypatch.setattr(causes, "to_try", lambda look, first: ())
         monkeypatch.setattr(causes, "_further", further)
         return at, _otherwise(at, origin, (), BENCH.model, (), silent)
 

@@ -27,15 +27,7 @@ from jaxsid.gap.explain import (
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, changes_found, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored, likeliest
-from jaxsid.gap.look import (
-    Look,
-    at_likeliest,
-    attached_candidates,
-    candidates_of,
-    further_candidates,
-    looked,
-    varied,
-)
+from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_of, looked, to_try, varied
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
@@ -266,7 +258,7 @@ def _effects(at: _Found, model: LumpedModel, seen: Sequence[Record], say: Callab
         at = _reconsidered(at, model, seen, say)
         if len(at.selected) >= most:
             break
-        candidates = further_candidates(at.look, first)
+        candidates = to_try(at.look, first)
     return at
 
 
@@ -314,7 +306,7 @@ def _elsewhere(
     at = _left(origin.taken(anew), model, seen)
     if at.look.clear:
         return at
-    return _further(at, further_candidates(at.look, first), FURTHER, model, seen, say)
+    return _further(at, to_try(at.look, first), FURTHER, model, seen, say)
 
 
 def _otherwise(
@@ -335,7 +327,7 @@ def _otherwise(
     say(f"{y.kind} in place of {best.kind}")
     others = tuple(x for x in ranking.ranked if x is not y)
     other = _left(origin.taken(ranking._replace(ranked=(y, *others))), model, seen)
-    further = _further(other, further_candidates(other.look, first), FURTHER, model, seen, say)
+    further = _further(other, to_try(other.look, first), FURTHER, model, seen, say)
     return further if len(further.selected) > len(at.selected) else at
 
 

@@ -104,7 +104,7 @@ def at_likeliest(look: Look, candidates: Sequence[Candidate]) -> tuple[Candidate
     return tuple(c for c in candidates if ends_of(c.place) == place)
 
 
-def further_candidates(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def to_try(look: Look, first: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """What now comes first, in turn with what does where it most probably arises, and what came next to the first.
 
     Nothing where nothing is left.
