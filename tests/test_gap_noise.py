@@ -141,7 +141,7 @@ def test_what_comes_and_goes_is_no_noise(what, pole):
     np.testing.assert_allclose(found.level / 0.02, 1, atol=0.15)
 
 
-@pytest.mark.parametrize("shape", [(1, 800), (1, 6000), (30, 128)])
+@pytest.mark.parametrize("shape", [(1, 20), (1, 500), (1, 800), (1, 6000), (30, 20), (30, 128)])
 @pytest.mark.parametrize("pole", [0.0, 0.6, 0.95])
 def test_noise_that_is_there_throughout_is_all_of_what_is_left(pole, shape):
     for seed in range(20):

@@ -31,9 +31,7 @@ SHORTEST = 128  # samples of a period or a quiet part that tells of noise
 QUIET = 1e-4  # largest input of a quiet part, next to the largest
 BANDS = 24  # of which the quietest is taken for noise
 STRETCHES = 8  # of time, in the quietest of which a band shows what is there throughout
-STEADY = (
-    0.5  # part of the power of what is left, that if less is there throughout it alone is taken for noise
-)
+STEADY = 0.4  # part of what is left, in power: where less is there throughout, that alone is noise
 SHARED = 1.5  # lines that share what one shows, with a window of Hann
 FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
@@ -266,7 +264,9 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     signals = signals if signals.ndim == 3 else signals[None]
     noise = _fitted(signals, SOURCES[3])
     level, taps = noise.level.copy(), noise.taps.copy()
-    for j in np.flatnonzero(np.isfinite(level)):
+    # of too few samples nothing tells whether they are alike throughout
+    long = (signals.shape[1] - MOST) // _parts(len(signals)) >= 4 * BANDS
+    for j in np.flatnonzero(np.isfinite(level) & long):
         own = signals[:, :, j] - signals[:, :, j].mean()
         # where what is there throughout is white all bands tell as much
         colour, _ = _filter_of(_steady_power(own)[1])
@@ -277,19 +277,22 @@ def residual_noise(signals: Float[np.ndarray, "*segments samples outputs"]) -> N
     return Noise(level, taps, 0.0, SOURCES[3])
 
 
+def _parts(count: int) -> int:
+    """That each of so many pieces is cut into, for as many stretches as are compared."""
+    return -(-STRETCHES // count)
+
+
 def _steady_power(
     signal: Float[np.ndarray, "segments samples"],
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """Power by frequency: the mean over time, and the least, in bands, of as many stretches as are compared."""
     count, length = signal.shape
-    each = 1 if count >= STRETCHES else -(-STRETCHES // count)
+    each = _parts(count)
     even = length // each // 2 * 2
     pieces = signal[:, : each * even].reshape(count * each, even)
     window = np.hanning(even)
     lines = np.abs(np.fft.rfft(pieces * window)) ** 2 / max((window**2).sum(), np.finfo(float).tiny)
     whole = lines.mean(axis=0)
-    if len(whole) < 2 * BANDS:
-        return whole, whole
     stretches = np.stack([x.mean(axis=0) for x in np.array_split(lines, STRETCHES)])
     steady = np.empty_like(whole)
     for band in np.array_split(np.arange(len(whole)), BANDS):
