@@ -33,10 +33,11 @@ B12, B23 = {"between": ("b1", "b2")}, {"between": ("b2", "b3")}
 BENCH = Bench(chain(), (), (), (), np.zeros(9), np.zeros(9), np.zeros(6), 1, 2, (), ())  # of no matter here
 
 
-def refit(evidence, squares=1000.0, equations=1000, hypothesis=None):
+def refit(evidence, squares=1000.0, equations=1000, hypothesis=None, deviation=0.1):
     nothing = np.zeros(1)
     fit = Fit(nothing, (), squares, equations, np.eye(1), evidence, 5, True)
-    return Refit(hypothesis or Hypothesis(), fit, None, (), None)
+    of = hypothesis or Hypothesis()
+    return Refit(of, fit, None, tuple({"size": deviation} for _ in of.effects), None)
 
 
 def candidate(kind, place, **parameters):
@@ -221,7 +222,7 @@ LOOKED, AGAIN = SimpleNamespace(clear=True), SimpleNamespace(clear=True)
 
 
 def explained(kind, place, evidence, effects):
-    of = Hypothesis(tuple(Effect(k, tuple(p.items()), {}) for k, p in effects))
+    of = Hypothesis(tuple(Effect(k, tuple(p.items()), {"size": -1.0}) for k, p in effects))
     return Explanation(kind, place, refit(evidence, hypothesis=of), evidence, 0.9, 1.0)
 
 
@@ -241,8 +242,8 @@ def two(monkeypatch):
     monkeypatch.setattr(module, "tied", lambda bench, found, **_: (bench, found))
     monkeypatch.setattr(module, "weighed_anew", lambda bench, found, **_: bench)
 
-    def set_up(evidences):
-        """(cubic, backlash, neither) beside hysteresis."""
+    def set_up(evidences, deviation=0.1):
+        """(cubic, backlash, neither) beside hysteresis, and how well the first one's number is known."""
         value = dict(zip(("cubic_stiffness", "backlash", None), evidences, strict=True))
         asked = []
 
@@ -260,7 +261,8 @@ def two(monkeypatch):
 
         monkeypatch.setattr(module, "refitted", fitted)
         monkeypatch.setattr(module, "rank_again", rank_again)
-        found = _reconsidered(at, chain(), (), lambda text: None)
+        whole = at.before._replace(deviations=({"size": deviation}, {"size": 0.1}))
+        found = _reconsidered(at._replace(before=whole), chain(), (), lambda text: None)
         # what was next to it, and what comes first beside the other
         assert asked[0] == ["cubic_stiffness", "backlash", "coulomb_friction"]
         return found, asked
@@ -294,6 +296,20 @@ def test_an_effect_that_a_later_one_makes_needless_is_left_out(two):
     assert len(found.rounds) == 1
     assert found.before is found.selected[-1].refit
     assert [e.kind for e in found.before.hypothesis.effects] == ["hysteresis"]
+
+
+def test_an_effect_of_which_no_number_is_told_from_zero_is_left_out(two):
+    before, _ = two((0.0, -20.0, -300.0))
+    known = before.selected[0]
+    assert known.told
+    unknown = known._replace(refit=before.before._replace(deviations=({"size": 0.4}, {"size": 0.1})))
+    assert not unknown.told
+    # the other one of the same fit is
+    assert unknown._replace(kind="hysteresis", place=B23).told
+    # and so are numbers of the model, which have their own deviations
+    assert unknown._replace(kind="mass_error", place={"body": "b1"}).told
+    found, _ = two((0.0, -20.0, -300.0), deviation=0.4)
+    assert [x.kind for x in found.selected] == ["hysteresis"]
 
 
 # verdicts

@@ -7,7 +7,16 @@ from gap_helpers import DT, JOINT, SENSED, WALL, chain, drive, exact, noisy, rec
 from jaxsid.checks import InputError
 from jaxsid.gap.locate import locate
 from jaxsid.gap.places import Place, joint_of, places_of
-from jaxsid.mechanics.lumped import Connection, Matrices, lumped_model, second_order
+from jaxsid.mechanics.lumped import (
+    Connection,
+    Input,
+    Matrices,
+    Sensor,
+    Tolerance,
+    lumped_model,
+    second_order,
+)
+from jaxsid.records import Record
 
 CUBIC = ("cubic_stiffness", JOINT, {"coefficient": 3e6})
 B12, B1 = Place("between", ("b1", "b2")), Place("between", ("ground", "b1"))
@@ -28,6 +37,22 @@ CASES = [
 def measured(kind, place, parameters, kinds=SENSED, seed=0):
     u = drive(seed=seed)
     return u, noisy(with_effect(u, kind, place, parameters, kinds), seed=seed)
+
+
+def sliding(mass=95.0, damping=203.0, friction=20.0, dt=0.004, samples=2048, parts=40):
+    """Input and position of a body that slides with friction, implicit in its impulse so that rest is rest."""
+    t = np.arange(samples) * dt
+    push = 60 * np.sin(np.pi * t) + 30 * np.sin(3.4 * np.pi * t + 1) + 20 * np.sign(np.sin(0.46 * np.pi * t))
+    kept = np.exp(-damping / mass * dt / parts)
+    gain = (1 - kept) / damping
+    q, v, found = 0.0, 0.0, []
+    for force in push:
+        found.append(q)
+        for _ in range(parts):
+            free = kept * v + gain * force
+            after = free - np.clip(free, -gain * friction, gain * friction)
+            q, v = q + dt / parts * (v + after) / 2, after
+    return push, np.array(found)
 
 
 @pytest.mark.parametrize(("kind", "place", "parameters", "expected"), CASES)
@@ -68,6 +93,29 @@ def test_delays_of_one_sensor_and_of_the_input_are_one_set():
     found = locate(chain(kinds), record(u, y, kinds))
     assert {Place("sensor", ("s1",)), DRIVE} <= set(found.likely)
     assert len({x.probability for x in found.ranked if x.place in (Place("sensor", ("s1",)), DRIVE)}) == 1
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-4])
+def test_friction_of_a_free_axis_is_no_cancelled_input(noise):
+    """An input cancelled whole, with mass and damper next to zero, explains every record, and is no explanation."""
+    push, slide = sliding()
+    y = slide + noise * slide.std() * np.random.default_rng(0).standard_normal(len(slide))
+    model = lumped_model(
+        ["b1"],
+        [96.0],
+        [0.0],
+        [200.0],
+        connections=[Connection("guide", ("ground", "b1"))],
+        inputs=[Input("drive", "b1")],
+        sensors=[Sensor("q", "b1", "displacement")],
+        tolerance=Tolerance(0.05, 0.05, 0.3),
+    )
+    found = locate(model, Record(push[:, None], y[:, None], 0.004, inputs=("drive",), outputs=("q",)))
+    assert found.ranked[0].place == B1
+    assert set(found.likely) == {B1, DRIVE}
+    fast = np.abs(found.maps[0].velocity) > 0.1 * found.maps[0].velocity.std()
+    friction = -20.0 * np.sign(found.maps[0].velocity)
+    assert np.corrcoef(found.maps[0].force[fast], friction[fast])[0, 1] > 0.9
 
 
 def test_force_is_that_of_the_law():

@@ -1,9 +1,9 @@
 """Draws cases and writes them: what a user would have, and apart from it what is true.
 
-    .venv/bin/python benchmarks/blind/generate.py OUT --set dev|test --cases N [--samples 10000 5000] [--shard i/n]
+    .venv/bin/python benchmarks/blind/generate.py OUT --set SET --cases N [--samples 10000 5000] [--shard i/n]
 
-OUT/cases/NNNN/ gets model.toml, run1.csv and run2.csv, OUT/labels/NNNN.json the truth. A second run goes on where the
-first stopped. Imports nothing of the library.
+SET is one of those in plan.py. OUT/cases/NNNN/ gets model.toml, run1.csv and run2.csv, OUT/labels/NNNN.json the truth.
+A second run goes on where the first stopped. Imports nothing of the library.
 """
 
 import argparse

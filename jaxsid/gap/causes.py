@@ -343,8 +343,11 @@ def _further(
     ranking = rank(at.bench, candidates, at.before, effort, say)
     if not ranking.ranked or not worth(ranking, LEAST if at.selected else _least(at.look)):
         return at.refused(ranking)
+    found = at.taken(ranking)
+    if not found.selected[-1].told:
+        return at.refused(ranking)
     say("what is left")
-    found = _left(at.taken(ranking), model, seen)
+    found = _left(found, model, seen)
     if found.look.clear:
         return found
     plain = plainer(ranking, at.before, effort, say)
@@ -402,7 +405,7 @@ def _turn(
     ranking = rank_again(at.bench._replace(states=states), at.before, x, others, without, FURTHER, say)
     ranking = ranking if at.look.clear else parsimonious(ranking)
     rounds, selected = list(at.rounds), list(at.selected)
-    if ranking.gain <= WORTH:
+    if ranking.gain <= WORTH or not x._replace(refit=at.before).told:
         del rounds[i], selected[i]
         selected[-1] = selected[-1]._replace(refit=without)
         return at._replace(rounds=tuple(rounds), selected=tuple(selected), before=without), True

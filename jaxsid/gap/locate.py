@@ -140,7 +140,9 @@ def scored(
         spectra = spectra_of(model, record)
         settings.append(setting_of(spectra, deviations(noise, spectra), directions, rate))
     tolerance = np.array([getattr(model.tolerance, x.quantity) for x in element_matrices(model).listed])
-    found = scores(model, settings, compared, tolerance)
+    # Evidence is tempered, what is known of the model beforehand is not. Else records with little noise would pay for
+    # the answer that explains all of them and means nothing: an input that is cancelled, masses and dampers of zero.
+    found = scores(model, settings, compared, tolerance / np.sqrt(TEMPERATURE))
     return Scored(model, tuple(settings), noises, compared, tolerance, found)
 
 

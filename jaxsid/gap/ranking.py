@@ -18,6 +18,7 @@ STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ f
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
+TOLD = 3.0  # standard deviations from zero from which on a number is known
 # kinds that are a wrong number of the model
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]
@@ -45,6 +46,18 @@ class Explanation(NamedTuple):
     @property
     def key(self) -> Key:
         return key_of(self.kind, self.place)
+
+    @property
+    def told(self) -> bool:
+        """Whether any number of its law is told from zero; true of numbers of the model.
+
+        A law of many numbers may take up what it does not describe: then none of them is known.
+        """
+        for effect, deviations in zip(self.refit.hypothesis.effects, self.refit.deviations, strict=True):
+            if key_of(effect.kind, dict(effect.place)) == self.key:
+                sizes = ((np.max(np.abs(v)), deviations[n]) for n, v in effect.parameters.items())
+                return any(size > TOLD * deviation for size, deviation in sizes)
+        return True
 
 
 class Ranking(NamedTuple):
