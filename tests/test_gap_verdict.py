@@ -16,7 +16,7 @@ from jaxsid.gap.explain import TEMPERATURE
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
 from jaxsid.gap.recalibrate import Recalibrated
-from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, Verdict, concluded, verdict_of
+from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, MISSED, Verdict, concluded, verdict_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
@@ -115,7 +115,8 @@ def test_one_doubtful_effect_of_two_makes_it_ambiguous():
 def test_unknown_is_what_leaves_most_of_the_gap_of_the_best_linear_model():
     found = verdict_of(examination(), causes(ranking(0.0, -500.0), closures=[closure(0.2)]))
     assert found.name == "unknown"
-    assert found.probability["unknown"] > 0.95
+    # what is in the catalogue is missed at times, as what is not is at times taken for it
+    assert found.probability["unknown"] == pytest.approx(1 - MISSED, abs=5e-3)
     # what counts is the last closure
     there = ranking(0.0, -500.0, kinds=[("hysteresis", B23), ("backlash", B23)])
     two = causes(ranking(0.0, -500.0), there, closures=[closure(0.2), closure(0.02)])

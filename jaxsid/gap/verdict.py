@@ -23,6 +23,7 @@ MOST = 0.5  # part of what was left that an effect beside an unknown one explain
 IMITATED = 0.6  # probability that two such springs at one place stand for one that is not in the catalogue
 POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
+MISSED = 0.08  # likewise of those in which nothing tried explains enough: the truth is an effect of the catalogue
 
 
 class Verdict(NamedTuple):
@@ -96,12 +97,12 @@ def _unexplained(causes: Causes, finding: str) -> float:
     """
     last = causes.closures[-1]
     if not causes.selected and causes.chosen is not causes.recalibrated:
-        return 1.0
+        return 1 - MISSED
     # what comes nearest to a law that is not there explains most of its gap, but not to the noise
     more = finding == "structure" and last.after > SURE * last.noise_floor
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
-    return float(LAPSE + (1 - LAPSE) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
+    return float(LAPSE + (1 - LAPSE - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
 def _imitating(selected: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
