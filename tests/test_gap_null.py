@@ -1,12 +1,15 @@
-"""The test for a lone frequency: as often as it should on noise, and wherever the frequency lies between two lines."""
+"""Tests for a lone frequency, a small offset, and elements off by more than they may be, as often as they should."""
 
 import numpy as np
 import pytest
 from gap_bench import known
-from gap_helpers import DT, chain, record
+from gap_helpers import DT, chain, drive, exact, noisy, record
+from scipy.special import gammaincc
 
-from jaxsid.gap.null import _lone_line
-from jaxsid.gap.recalibrate import as_given
+from jaxsid.gap.noise import noise_of
+from jaxsid.gap.null import _lone_line, null_test, ratio_law
+from jaxsid.gap.places import places_of
+from jaxsid.gap.recalibrate import as_given, recalibrated
 
 SAMPLES = 800
 
@@ -45,3 +48,38 @@ def test_low_frequencies_are_no_lone_one_at_the_other_end():
 
 def test_the_shortest_records_have_a_test_too():
     assert 0 < lone(white(0)[:64]).p_value <= 1
+
+
+VELOCITIES = tuple((body, "velocity") for body in range(3))
+
+
+@pytest.mark.parametrize(("offset", "found"), [(0.0, False), (1.0, True)])
+def test_an_offset_as_large_as_the_noise_is_found(offset, found):
+    """In the mean of a thousand samples it is thirty times the noise, and the only line that holds it."""
+    u = drive(seed=1)
+    y = noisy(exact(u, VELOCITIES), seed=1)
+    y[:, 1] += offset * 0.01 * y[:, 1].std()
+    records = [record(u, y, VELOCITIES)]
+    model = chain(VELOCITIES)
+    fit = recalibrated(model, records, noise_of(model, records), wide=True)
+    p = null_test(fit, places_of(model)).p_value
+    assert p < 1e-6 if found else p > 0.01
+
+
+@pytest.mark.parametrize("told", [9, 2, 1])
+def test_elements_within_their_tolerance_are_as_far_off_as_chance_has_it(told):
+    """Of linear models in closed form, with as many combinations of elements told by the records as that."""
+    rng, draws = np.random.default_rng(told), 4000
+    near, far = np.repeat([0.005, 0.05], [6, 3]), np.repeat([0.3, 1.0], [6, 3])
+    slopes = rng.standard_normal((30, told)) @ rng.standard_normal((told, 9)) * 10.0 ** rng.uniform(1, 4, 9)
+    information = slopes.T @ slopes
+    scale, degrees = ratio_law(information, near, far)
+    assert scale * degrees == pytest.approx(told, rel=0.1)
+    y = slopes @ (near[:, None] * rng.standard_normal((9, draws))) + rng.standard_normal((30, draws))
+    within = np.linalg.inv(np.eye(30) + (slopes * near**2) @ slopes.T)
+    freely = np.eye(30) - slopes @ np.linalg.solve(information + np.diag(far**-2.0), slopes.T)
+    ratio = (y * (within @ y)).sum(axis=0) - ((freely @ y) ** 2).sum(axis=0)
+    p = gammaincc(degrees / 2, np.maximum(ratio, 0.0) / scale / 2)
+    for level in (0.5, 0.05, 0.01):
+        spread = np.sqrt(level * (1 - level) / draws)
+        assert abs((p < level).mean() - level) < 4 * spread

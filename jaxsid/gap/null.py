@@ -112,15 +112,43 @@ def _beyond(test: Test, carried: float) -> Test:
 def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
     """Probability, by chance, of elements as far from their nominal values as the records ask for.
 
-    Twice the logarithm of the ratio of likelihoods follows a chi-squared law with a degree for each element.
+    Twice the logarithm of the ratio of likelihoods is a sum of squares of normal variables, of which those count that
+    the records tell of: where few modes are excited they are fewer than the elements.
 
     Args:
         within: refitted with the model's tolerance as prior.
-        freely: refitted without, to the same noise.
+        freely: refitted with a wide one, to the same noise.
     """
     drawn = float(((within.change / within.prior) ** 2).sum())
     ratio = max(within.squares + drawn - freely.squares, 0.0)
-    return float(gammaincc(len(within.change) / 2, ratio / 2))
+    information = np.sum([np.asarray(x.gram)[:-1, :-1] for x in within.linear], axis=0)
+    scale, degrees = ratio_law(information, within.prior, freely.prior)
+    return float(gammaincc(degrees / 2, ratio / scale / 2))
+
+
+def ratio_law(
+    information: Float[np.ndarray, "e e"], near: Float[np.ndarray, " e"], far: Float[np.ndarray, " e"]
+) -> tuple[float, float]:
+    """Scale and degrees of the chi-squared law that has the mean and variance of the ratio where elements are near.
+
+    With changes x ~ N(0, P), of information H about them, all in units of the root of P, and the wide prior 1 / D, the
+    ratio is b' M b with M = 2 G - G H G - (1 + H)^-1, G = (H + D)^-1, and b of covariance C = H + H H. Its mean is
+    tr(M C) and its variance 2 tr(M C M C), where M C = 1 - (G D) (G D) (1 + H).
+
+    Args:
+        information: of the records about the changes, J' J.
+        near: standard deviations of the changes, the root of P.
+        far: those of the wide prior, the root of W.
+
+    Source: F. Satterthwaite, Biometrics Bulletin 2 (1946).
+    """
+    H, D = near[:, None] * information * near, np.diag((near / far) ** 2)
+    kept = np.linalg.solve(H + D, D)
+    product = np.eye(len(near)) - kept @ kept @ (np.eye(len(near)) + H)
+    mean, variance = float(np.trace(product)), 2 * float(np.trace(product @ product))
+    if mean <= 0 or variance <= 0:
+        return 1.0, 1.0
+    return variance / mean / 2, 2 * mean**2 / variance
 
 
 def _laws(
@@ -246,9 +274,12 @@ def _own(fit: Recalibrated, settings: tuple[Setting, ...]) -> tuple[tuple[InputN
 
 
 def _leveled(setting: Setting, linear: Linear) -> Setting:
-    """The setting with the noise's level taken from what is left around each line, whatever a filter makes of it."""
+    """The setting with the noise's level taken from what is left around each line, whatever a filter makes of it.
+
+    An offset is in one line alone, and would there be taken for the level.
+    """
     white = linear.left * setting.scale
-    level = line_level(white, (setting.scale > 0) * 1.0)
+    level = line_level(white, ((setting.scale > 0) * 1.0).at[0].set(0.0))
     return eqx.tree_at(lambda s: s.scale, setting, setting.scale / level)
 
 
