@@ -10,7 +10,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
 from jaxsid.gap import causes as module
-from jaxsid.gap.causes import LEAST, OFF, _beyond, _Found, _off, _reconsidered
+from jaxsid.gap.causes import LEAST, OFF, TELLING, _beyond, _Found, _numbers, _off, _reconsidered
 from jaxsid.gap.explain import (
     TEMPERATURE,
     _distinct,
@@ -214,6 +214,19 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
     assert again == ["stiffness_error"]
     still = found._replace(fit=found.fit._replace(theta=0 * theta))
     assert _off(at._replace(before=still)) == ()
+
+
+@pytest.mark.parametrize(("scored", "named"), [(None, 1), ("places", 0)])
+def test_where_numbers_alone_are_in_doubt_the_one_that_explains_most_is_named(monkeypatch, scored, named):
+    """Tests have said that some number is off; beside a law that is missing they have not."""
+    little = ranking(-1.0, without=-1.0 - 0.5 * TELLING * TEMPERATURE, kinds=[("stiffness_error", B12)])
+    assert 0 < little.gain < TELLING
+    offs = [(candidate("stiffness_error", B12),), ()]
+    monkeypatch.setattr(module, "_off", lambda at: offs.pop(0))
+    monkeypatch.setattr(module, "rank", lambda *_: little)
+    monkeypatch.setattr(_Found, "taken", lambda at, found: at._replace(selected=found.ranked[:1]))
+    at = _Found(BENCH, SimpleNamespace(scored=scored), (), (), refit(0.0))
+    assert len(_numbers(at, (), chain(), (), lambda text: None).selected) == named
 
 
 # effects asked again

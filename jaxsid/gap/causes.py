@@ -50,7 +50,7 @@ from jaxsid.records import Record
 
 MOST_EFFECTS = 2
 SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
-TELLING = 4.0  # tempered gain of evidence from which on numbers are taken
+TELLING = 4.0  # tempered gain of evidence from which on numbers are taken beside effects
 LACKING = 4  # springs, dampers, masses that are tried beside them
 POLISHED = 60  # most steps of the fit of what is chosen
 OFF = 2.5  # tolerances from which on a number may be wrong
@@ -452,7 +452,7 @@ def _numbers(
     seen: Sequence[Record],
     say: Callable[[str], None],
 ) -> _Found:
-    """Numbers of the model that are off by more than they may be, one after another, and what looks like them."""
+    """Numbers off by more than they may be, and what looks like them; the first where tests doubt numbers alone."""
     begun = len(at.selected)
     while len(at.selected) < MOST_EFFECTS and at.before is not None:
         off = _off(at)
@@ -461,7 +461,7 @@ def _numbers(
         # the number farthest off, what the model lacks, the others
         candidates = (*off[:1], *lacking, *off[1:])
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
-        if ranking.gain <= TELLING:
+        if ranking.gain <= (TELLING if at.selected or at.look.scored is not None else 0.0):
             at = at.refused(ranking)
             break
         at = at.taken(ranking)

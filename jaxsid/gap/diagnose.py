@@ -213,7 +213,10 @@ class Diagnosis(NamedTuple):
         return {"factor": {"value": 1 + float(theta[i]), "std": std, "unit": ""}}
 
     def _wrong_numbers(self) -> list[dict[str, Any]]:
-        """Errors of the model's own numbers that stand out, where all of them together explain the gap."""
+        """Errors of the model's own numbers that stand out, where all of them together explain the gap.
+
+        Those beyond their tolerance, farthest first; where none is, all that are sure.
+        """
         assert self.causes is not None
         assert self.closure is not None
         fit, listed = self.causes.chosen.fit, element_matrices(self.nominal).listed
@@ -225,7 +228,9 @@ class Diagnosis(NamedTuple):
                 continue
             factor = {"value": 1 + change, "std": std, "unit": ""}
             place = plain_place(element_place(self.nominal, element))
-            found.append((abs(change) / std, ERRORS[element.quantity], place, factor))
+            tolerance = getattr(self.nominal.tolerance, element.quantity)
+            found.append((abs(change) / max(tolerance, std), ERRORS[element.quantity], place, factor))
+        beyond = [x for x in found if x[0] > 1] or found
         return [
             {
                 "kind": kind,
@@ -233,7 +238,7 @@ class Diagnosis(NamedTuple):
                 "parameters": {"factor": factor},
                 "gap_after": self.closure.by_sensor,
             }
-            for _, kind, place, factor in sorted(found, key=lambda x: -x[0])
+            for _, kind, place, factor in sorted(beyond, key=lambda x: -x[0])
         ]
 
 
