@@ -125,7 +125,8 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
         return 0.0, 1.0
     z, p = 1.959964, hits / count
     middle, half = p + z**2 / (2 * count), z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2))
-    return float((middle - half) / (1 + z**2 / count)), float((middle + half) / (1 + z**2 / count))
+    low, high = ((middle + side * half) / (1 + z**2 / count) for side in (-1, 1))
+    return max(float(low), 0.0), min(float(high), 1.0)  # rounding may lead beyond
 
 
 def share(chosen: Iterable[Scored], test: Callable[[Scored], bool]) -> dict[str, Any]:
