@@ -1,6 +1,7 @@
 """The diagnosis as a value, as JSON, as a page and as a command."""
 
 import json
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -160,6 +161,31 @@ def test_wrong_numbers_are_named():
     for x in selected:
         factor = x["parameters"]["factor"]
         assert abs(factor["value"] - 1 / 1.05) < 5 * factor["std"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "bodies"),
+    [
+        # of 0.5 % tolerance, known to 0.05 %: beyond it, within it, and beyond by what is hardly known
+        ((0.03, 0.004, 0.0), ["b1"]),
+        ((-0.02, 0.03, 0.0), ["b2", "b1"]),
+        ((0.004, 0.003, 0.0001), ["b1", "b2"]),
+    ],
+)
+def test_numbers_are_named_that_are_beyond_their_tolerance_farthest_first(changes, bodies):
+    listed = element_matrices(chain()).listed
+    theta = np.zeros(len(listed))
+    for body, change in zip(("b1", "b2", "b3"), changes, strict=True):
+        theta[[element_place(chain(), x) for x in listed].index({"body": body})] = change
+    fit = SimpleNamespace(theta=theta, covariance=np.eye(len(listed)) * 5e-4**2)
+    found = SimpleNamespace(
+        causes=SimpleNamespace(chosen=SimpleNamespace(fit=fit)),
+        closure=SimpleNamespace(by_sensor={}),
+        nominal=chain(),
+    )
+    named = module.Diagnosis._wrong_numbers(found)
+    assert [x["place"]["body"] for x in named] == bodies
+    assert {x["kind"] for x in named} == {"mass_error"}
 
 
 def test_a_spring_that_the_model_lacks_is_not_taken_for_wrong_numbers():

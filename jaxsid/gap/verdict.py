@@ -23,7 +23,7 @@ MOST = 0.5  # part of what was left that an effect beside an unknown one explain
 IMITATED = 0.6  # probability that two such springs at one place stand for one that is not in the catalogue
 POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
 LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
-MISSED = 0.08  # likewise of those in which nothing explains enough, although the catalogue holds the truth
+MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
 class Verdict(NamedTuple):
