@@ -10,7 +10,7 @@ from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
 
 from jaxsid import diagnose
 from jaxsid.gap import causes as module
-from jaxsid.gap.causes import LEAST, OFF, TELLING, _beyond, _Found, _numbers, _off, _reconsidered
+from jaxsid.gap.causes import LEAST, TELLING, _beyond, _Found, _numbers, _reconsidered
 from jaxsid.gap.explain import (
     TEMPERATURE,
     _distinct,
@@ -21,6 +21,7 @@ from jaxsid.gap.explain import (
 )
 from jaxsid.gap.fit import Fit
 from jaxsid.gap.noise import FINEST, noise_of, residual_noise
+from jaxsid.gap.numbers_off import OFF, numbers_off
 from jaxsid.gap.ranking import ERRORS, WORTH, Explanation, Ranking, alike, key_of, numbers_of, ranked, worth
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
@@ -204,16 +205,21 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
     stiff, heavy = elements_by_key(model)[key_of("stiffness_error", B12)][0], 1
     theta[stiff], theta[heavy], theta[0] = -0.03, 0.05, 0.9 * OFF * 0.01
     found = refit(0.0)._replace(fit=refit(0.0).fit._replace(theta=theta))
-    at = _Found(bench, None, (), (), found)
-    named = [key_of(c.kind, c.place) for c in _off(at) if c.kind in ERRORS.values()]
+    candidates = numbers_off(bench, found)
+    named = [key_of(c.kind, c.place) for c in candidates if c.kind in ERRORS.values()]
     assert named == [key_of("mass_error", {"body": "b2"}), key_of("stiffness_error", B12)]
     # gains can stand for numbers
-    assert [c.kind for c in _off(at)] == ["mass_error", "input_gain", "stiffness_error", *["sensor_gain"] * 3]
+    assert [c.kind for c in candidates] == [
+        "mass_error",
+        "input_gain",
+        "stiffness_error",
+        *["sensor_gain"] * 3,
+    ]
     known = found._replace(hypothesis=Hypothesis(wrong=(heavy,)))
-    again = [c.kind for c in _off(at._replace(before=known)) if c.kind in ERRORS.values()]
+    again = [c.kind for c in numbers_off(bench, known) if c.kind in ERRORS.values()]
     assert again == ["stiffness_error"]
     still = found._replace(fit=found.fit._replace(theta=0 * theta))
-    assert _off(at._replace(before=still)) == ()
+    assert numbers_off(bench, still) == ()
 
 
 @pytest.mark.parametrize(("scored", "named"), [(None, 1), ("places", 0)])
@@ -222,11 +228,30 @@ def test_where_numbers_alone_are_in_doubt_the_one_that_explains_most_is_named(mo
     little = ranking(-1.0, without=-1.0 - 0.5 * TELLING * TEMPERATURE, kinds=[("stiffness_error", B12)])
     assert 0 < little.gain < TELLING
     offs = [(candidate("stiffness_error", B12),), ()]
-    monkeypatch.setattr(module, "_off", lambda at: offs.pop(0))
+    monkeypatch.setattr(module, "numbers_off", lambda *_: offs.pop(0))
+    monkeypatch.setattr(module, "hint", lambda *_: TELLING)
     monkeypatch.setattr(module, "rank", lambda *_: little)
     monkeypatch.setattr(_Found, "taken", lambda at, found: at._replace(selected=found.ranked[:1]))
     at = _Found(BENCH, SimpleNamespace(scored=scored), (), (), refit(0.0))
     assert len(_numbers(at, (), chain(), (), lambda text: None).selected) == named
+
+
+def test_beside_a_law_numbers_are_ranked_only_where_a_quick_fit_of_one_hints_at_it(monkeypatch):
+    """Else minutes would go into telling apart what no records tell."""
+    hints = {"stiffness_error": 0.4 * TELLING, "input_gain": 0.3 * TELLING}
+    off = candidate("stiffness_error", B12), candidate("input_gain", {"input": "drive"})
+    monkeypatch.setattr(module, "numbers_off", lambda *_: off)
+    monkeypatch.setattr(module, "hint", lambda bench, found, x, effort: hints[x.kind])
+    ranked_ones = []
+    monkeypatch.setattr(
+        module, "rank", lambda bench, found, *_: ranked_ones.append(found) or ranking(-1.0, without=-1.0)
+    )
+    at = _Found(BENCH, SimpleNamespace(scored="places"), (), (), refit(0.0))
+    assert _numbers(at, (), chain(), (), lambda text: None) is at
+    assert not ranked_ones
+    hints["input_gain"] = 0.6 * TELLING
+    _numbers(at, (), chain(), (), lambda text: None)
+    assert ranked_ones == [off]
 
 
 # effects asked again

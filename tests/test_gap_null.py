@@ -7,7 +7,7 @@ from gap_helpers import DT, chain, drive, exact, noisy, record
 from scipy.special import gammaincc
 
 from jaxsid.gap.noise import noise_of
-from jaxsid.gap.null import _lone_line, null_test, ratio_law
+from jaxsid.gap.null import _lone_line, farthest_test, null_test, ratio_law
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, recalibrated
 
@@ -83,3 +83,27 @@ def test_elements_within_their_tolerance_are_as_far_off_as_chance_has_it(told):
     for level in (0.5, 0.05, 0.01):
         spread = np.sqrt(level * (1 - level) / draws)
         assert abs((p < level).mean() - level) < 4 * spread
+
+
+@pytest.mark.parametrize("told", [9, 2, 0])
+def test_one_element_among_many_is_found_as_far_off_as_chance_has_it(told):
+    """At most as often as said, and nearly so where each is told apart; what the sum hides is found."""
+    rng, draws = np.random.default_rng(told + 1), 4000
+    near = np.repeat([0.005, 0.05], [6, 3])
+    slopes = (
+        rng.standard_normal((30, 9)) * np.where(np.arange(9) < told, 1e3, 0.0) / np.repeat([1, 10], [6, 3])
+    )
+    information = slopes.T @ slopes
+    gain = np.linalg.solve(information + np.diag(near**-2.0), slopes.T)
+    x = near[:, None] * rng.standard_normal((9, draws))
+    noise = rng.standard_normal((30, draws))
+    p = np.array([farthest_test(c, information, near) for c in (gain @ (slopes @ x + noise)).T])
+    for level in (0.05, 0.01):
+        spread = np.sqrt(level * (1 - level) / draws)
+        assert (p < level).mean() < level + 4 * spread
+        if told == 9:
+            assert (p < level).mean() > level - 4 * spread
+    if told:
+        x[0] = 6 * near[0]
+        p = np.array([farthest_test(c, information, near) for c in (gain @ (slopes @ x + noise)).T])
+        assert (p < 0.001).mean() > 0.9

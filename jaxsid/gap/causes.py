@@ -10,13 +10,11 @@ from jaxsid.gap.closely import PARTED, begun_near, closely, motions_to_begin, pa
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
-    ERRORS,
     FIRST,
     FURTHER,
     NUMBERS,
     Effort,
     again,
-    element_place,
     elements_by_key,
     elsewhere,
     extended,
@@ -31,6 +29,7 @@ from jaxsid.gap.look import Look, at_likeliest, attached_candidates, candidates_
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
+from jaxsid.gap.numbers_off import hint, numbers_off
 from jaxsid.gap.ranking import WORTH, Explanation, Ranking, alike, key_of, loud, notable, parsimonious, worth
 from jaxsid.gap.refit import (
     Bench,
@@ -45,7 +44,6 @@ from jaxsid.gap.refit import (
 )
 from jaxsid.gap.screen import Candidate, unseen
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.physical.elements import element_matrices
 from jaxsid.records import Record
 
 MOST_EFFECTS = 2
@@ -53,7 +51,6 @@ SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 TELLING = 4.0  # tempered gain of evidence from which on numbers are taken beside effects
 LACKING = 4  # springs, dampers, masses that are tried beside them
 POLISHED = 60  # most steps of the fit of what is chosen
-OFF = 2.5  # tolerances from which on a number may be wrong
 LEAST = 0.01  # part of all that is left that an effect must remove, or a first one MOSTLY what tests find
 MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
@@ -455,13 +452,16 @@ def _numbers(
     """Numbers off by more than they may be, and what looks like them; the first where tests doubt numbers alone."""
     begun = len(at.selected)
     while len(at.selected) < MOST_EFFECTS and at.before is not None:
-        off = _off(at)
-        if not off:
+        off = numbers_off(at.bench, at.before)
+        least = TELLING if at.selected or at.look.scored is not None else 0.0
+        if not off or (
+            least and not any(hint(at.bench, at.before, x, NUMBERS) > least / 2 for x in (*off, *lacking))
+        ):
             return at
         # the number farthest off, what the model lacks, the others
         candidates = (*off[:1], *lacking, *off[1:])
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
-        if ranking.gain <= (TELLING if at.selected or at.look.scored is not None else 0.0):
+        if ranking.gain <= least:
             at = at.refused(ranking)
             break
         at = at.taken(ranking)
@@ -469,22 +469,6 @@ def _numbers(
         say("what is left")
         at = _reconsidered(_left(at, model, seen), model, seen, say)
     return at
-
-
-def _off(at: _Found) -> tuple[Candidate, ...]:
-    """The model's numbers that its fit holds for off, farthest first, and gains."""
-    assert at.before is not None
-    bench, wrong = at.bench, at.before.hypothesis.wrong
-    model, listed = bench.model, element_matrices(bench.model).listed
-    far = np.abs(at.before.fit.theta[: len(listed)]) / bench.tolerance
-    begin = changes_of(at.before, bench)
-    new = lambda kind, place, parameters: Candidate(kind, place, parameters, begin, 0.0, np.nan, "", {})  # noqa: E731
-    rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
-    off = [x for x in rows if far[list(x)].max() > OFF and not {*x} <= {*wrong}]
-    found = [new(ERRORS[listed[i].quantity], element_place(model, listed[i]), {}) for i, *_ in off]
-    found[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
-    found += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]
-    return tuple(found) if off else ()
 
 
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:

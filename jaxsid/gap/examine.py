@@ -11,7 +11,7 @@ from jaxsid.checks import require
 from jaxsid.gap.locate import Locations, Scored, located, scored
 from jaxsid.gap.measure import Gap, gap_of
 from jaxsid.gap.noise import Noise, noise_of
-from jaxsid.gap.null import SIGNIFICANT, Null, null_test, tolerance_test
+from jaxsid.gap.null import SIGNIFICANT, Null, null_test, tolerance_tests
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
 from jaxsid.gap.spectra import in_time
@@ -141,10 +141,10 @@ def examine(
     say("is the gap real")
     places = places_of(model)
     null, near = null_test(freely, places), null_test(within, places)
-    drawn = tolerance_test(within, freely)
+    drawn = tolerance_tests(within, freely)
     structural = null.p_value < SIGNIFICANT and null.share > NEGLIGIBLE
     # what is of no matter is no reason to doubt the model, however surely it is there
-    nominal = min(1.0, 2 * min(drawn, near.p_value if near.share > NEGLIGIBLE else 1.0))
+    nominal = min(1.0, 3 * min(*drawn, near.p_value if near.share > NEGLIGIBLE else 1.0))
     off = structural or nominal < SIGNIFICANT
     # what an unmodelled law leaves is no noise
     noises = guessed if structural else freely.noises

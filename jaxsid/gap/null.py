@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
 from jaxtyping import Float
+from scipy.stats import norm
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
@@ -31,6 +32,7 @@ from jaxsid.impulse.lines import line_level
 SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: of two questions, 1 % together
 DOUBT = 0.05  # likewise, from which on nothing speaks for it either
 COMMON, CHANGE = "common to sensors", "change with time"
+UNTOLD = 1e-6  # of an element's variance beforehand: less than that tells nothing of it
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
@@ -109,11 +111,12 @@ def _beyond(test: Test, carried: float) -> Test:
     return test._replace(share=float(np.sqrt(test.share**2 - min(carried, test.share) ** 2)))
 
 
-def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
-    """Probability, by chance, of elements as far from their nominal values as the records ask for.
+def tolerance_tests(within: Recalibrated, freely: Recalibrated) -> tuple[float, float]:
+    """Probabilities, by chance, of elements as far from their nominal values as the records ask for: all, and any one.
 
     Twice the logarithm of the ratio of likelihoods is a sum of squares of normal variables, of which those count that
-    the records tell of: where few modes are excited they are fewer than the elements.
+    the records tell of: where few modes are excited they are fewer than the elements. One that is far off among many
+    is little of that sum: see `farthest_test`.
 
     Args:
         within: refitted with the model's tolerance as prior.
@@ -123,7 +126,28 @@ def tolerance_test(within: Recalibrated, freely: Recalibrated) -> float:
     ratio = max(within.squares + drawn - freely.squares, 0.0)
     information = np.sum([np.asarray(x.gram)[:-1, :-1] for x in within.linear], axis=0)
     scale, degrees = ratio_law(information, within.prior, freely.prior)
-    return float(gammaincc(degrees / 2, ratio / scale / 2))
+    together = float(gammaincc(degrees / 2, ratio / scale / 2))
+    return together, farthest_test(within.change, information, within.prior)
+
+
+def farthest_test(
+    change: Float[np.ndarray, " e"], information: Float[np.ndarray, "e e"], near: Float[np.ndarray, " e"]
+) -> float:
+    """Probability, by chance, that any element is found so many of its deviations from its nominal value.
+
+    Of changes that are drawn from N(0, P) and told by their information H, the posterior means have the covariance
+    P - (H + 1 / P)^-1. The largest of e is as Sidak has it, or less probable where they are found together.
+
+    Args:
+        change: the posterior means.
+        information: of the records about them, J' J.
+        near: standard deviations beforehand, the root of P.
+
+    Source: Z. Sidak, J. Am. Stat. Assoc. 62 (1967).
+    """
+    told = 1 - np.diag(np.linalg.inv(near[:, None] * information * near + np.eye(len(near))))
+    far = np.abs(change / near) / np.sqrt(np.maximum(told, UNTOLD))
+    return float(1 - (1 - 2 * norm.sf(far.max())) ** len(far))
 
 
 def ratio_law(

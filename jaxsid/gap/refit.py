@@ -410,9 +410,9 @@ def refitted(
     theta = np.concatenate([start, z.ravel(), shifts_of(effects, bench.records)])
     plain = 2 * len(bench.model.bodies)
     given = [_with_own(s, plain, slots.count) for s in (bench.states if states is None else states)]
-    # all but laws is integrated exactly
-    laws = any(sort_of(CATALOGUE[e.kind]) != "linear" for e in effects)
-    search = {"substeps": bench.substeps if laws else 1, "steps": steps, "gain": gain}
+    # all but laws and what comes late between two samples is integrated exactly
+    exact = all(sort_of(CATALOGUE[e.kind]) == "linear" and e.kind != "input_delay" for e in effects)
+    search = {"substeps": 1 if exact else bench.substeps, "steps": steps, "gain": gain}
     fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, **search)
     return _concluded(bench, hypothesis, shot, fit)
 

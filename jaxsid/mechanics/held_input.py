@@ -1,6 +1,6 @@
 """Inputs between samples: held, late by any time, and cut into steps shorter than the sampling interval.
 
-Over a step an input is replaced by the straight line with the same mean and first moment, which is exact for both
+Over a step an input is replaced by the parabola with the same mean, first and second moments, which is exact for both
 holds where no late sample arrives within the step, and else errs by less than (w step)^3 of the jump's part.
 """
 
@@ -61,18 +61,24 @@ def value_at_sample(late: Late) -> Float[Array, "samples inputs"]:
     return jnp.where(late.arrival > 0, old, late.new)
 
 
-def line_over_step(late: Late, begin: Array, length: Array) -> tuple[Array, Array]:
-    """Value at the start and change over a step of the line with the input's mean and first moment.
+def parabola_over_step(late: Late, begin: Array, length: Array) -> tuple[Array, Array, Array]:
+    """a, b, c of a + b s + c (6 s^2 - 6 s + 1), s from 0 to 1 over a step, with the input's mean and two moments.
+
+    The last polynomial has neither mean nor first moment, so c is zero where no late sample arrives within the step.
 
     Args:
         late: of one sample, each field (inputs,).
         begin: of the step, in sampling intervals.
         length: of the step, in sampling intervals.
     """
-    # of the step, before the arrival; a quotient in a loop would be computed apart from all else
-    part = jnp.clip((late.arrival - begin) * (1 / length), 0.0, 1.0)
-    jump, bend = late.new - late.old, (late.old_slope - late.new_slope) * length
+    # in steps; a quotient in a loop would be computed apart from all else
+    arrival = (late.arrival - begin) * (1 / length)
+    part, bend = jnp.clip(arrival, 0.0, 1.0), (late.old_slope - late.new_slope) * length
+    # of the two lines where the part of the step before the arrival ends
+    jump = late.new - late.old + bend * (arrival - part)
     middle = late.new + late.new_slope * (begin + 0.5 * length - late.arrival)
     mean = middle - jump * part - 0.5 * bend * part**2
     change = late.new_slope * length + 6 * jump * part * (1 - part) + bend * (3 * part**2 - 2 * part**3)
-    return mean - 0.5 * change, change
+    before_after = part * (1 - part)
+    curve = -5 * before_after * (jump * (1 - 2 * part) + 0.5 * bend * before_after)
+    return mean - 0.5 * change, change, curve

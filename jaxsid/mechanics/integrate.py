@@ -4,6 +4,7 @@ Runge and Kutta's method with the matrix exponential (S. Cox and P. Matthews, J.
 which the laws' forces enter through few ports only; dry friction acts on top, with its mean over each step.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from jaxsid.mechanics.dry_friction import acting, friction, holding
 from jaxsid.mechanics.effects.catalogue import forces, possible, rates, slips
 from jaxsid.mechanics.effects.kind import Motion
 from jaxsid.mechanics.functions_of_matrices import phi_functions
-from jaxsid.mechanics.held_input import Late, line_over_step
+from jaxsid.mechanics.held_input import Late, parabola_over_step
 from jaxsid.mechanics.slots import Slots
 
 
@@ -40,8 +41,8 @@ class Step(eqx.Module):
     """Matrices of one step; everything that the linear part does is in the first product.
 
     Attributes:
-        linear: (n + 9 slots, n + 2 inputs) from state and input's line: the state at the end, and what the laws see
-            at the start, in the middle and at the end, without forces.
+        linear: (n + 9 slots, n + 3 inputs) from state and input's parabola: the state at the end, and what the laws
+            see at the start, in the middle and at the end, without forces.
         middle, carried: (3 slots, ports) what forces of the first half do to what is seen in the middle, at the end.
         weights: (n, 3 ports) of the forces at the start, of the two in the middle together, at the end.
         rubs: (n, slots) what a mean force does to the state.
@@ -86,6 +87,17 @@ def moved_by(system: Augmented, times: Float[Array, " k"]) -> tuple[Array, Array
     return jax.vmap(partial(phi_columns, system.A, columns))(times)
 
 
+def pushed(moved: Sequence[Array], share: float) -> tuple[Array, Array, Array]:
+    """What each part of the parabola of `parabola_over_step` has done to the state after a share of the step.
+
+    Args:
+        moved: h phi_k(A h) B for k = 1, 2, 3, with h that share.
+        share: of the step.
+    """
+    one, two, three = moved
+    return one, share * two, 12 * share**2 * three - 6 * share * two + one
+
+
 def step_of(system: Augmented, moved: tuple[Array, Array, Array, Array]) -> Step:
     """Matrices of one step.
 
@@ -96,13 +108,12 @@ def step_of(system: Augmented, moved: tuple[Array, Array, Array, Array]) -> Step
     seen, ports, inputs = system.seen, system.G.shape[1], system.B.shape[1]
     slots = ports // 2
     whole, one, two, three = (x[0] for x in moved)
-    half, one_half, two_half, _ = (x[1] for x in moved)
-    end = jnp.concatenate([whole, one[:, ports:], two[:, ports:]], axis=1)
-    # the change over the step acts by half over its first half
-    middle = jnp.concatenate([half, one_half[:, ports:], two_half[:, ports:] / 2], axis=1)
-    start = jnp.concatenate([seen, jnp.zeros((3 * slots, 2 * inputs), seen.dtype)], axis=1)
+    half, *of_half = (x[1] for x in moved)
+    end = jnp.concatenate([whole, *(x[:, ports:] for x in pushed((one, two, three), 1.0))], axis=1)
+    middle = jnp.concatenate([half, *(x[:, ports:] for x in pushed(of_half, 0.5))], axis=1)
+    start = jnp.concatenate([seen, jnp.zeros((3 * slots, 3 * inputs), seen.dtype)], axis=1)
     G1, G2, G3 = (x[:, :ports] for x in (one, two, three))
-    first_half = one_half[:, :ports]
+    first_half = of_half[0][:, :ports]
     return Step(
         linear=jnp.concatenate([end, start, seen @ middle, seen @ end]),
         middle=seen @ first_half,
@@ -229,9 +240,9 @@ def _advance(
     begin, length = part
     n, count, inputs = len(system.A), slots.count, system.B.shape[1]
     speeds, h = system.seen[count : 2 * count], length * dt
-    value, change = line_over_step(Late(*row[:-1].reshape(5, inputs)), begin, length)
+    push = parabola_over_step(Late(*row[:-1].reshape(5, inputs)), begin, length)
     time = dt * (row[-1] + begin)
-    free = _apply(step.linear, jnp.concatenate([x, value, change]))
+    free = _apply(step.linear, jnp.concatenate([x, *push]))
     ahead, w0, wm, w1 = jnp.split(free, [n, n + 3 * count, n + 6 * count])
     law = partial(_ports, slots, system.spring)
     x1, mean = ahead, jnp.zeros_like(total)

@@ -8,8 +8,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsid.mechanics.augmented import Augmented, augmented
 from jaxsid.mechanics.effects.catalogue import possible
-from jaxsid.mechanics.held_input import Late, late_input, line_over_step, value_at_sample
-from jaxsid.mechanics.integrate import Path, instant_forces, integrate, integrate_twice, phi_columns
+from jaxsid.mechanics.held_input import Late, late_input, parabola_over_step, value_at_sample
+from jaxsid.mechanics.integrate import (
+    Path,
+    instant_forces,
+    integrate,
+    integrate_twice,
+    phi_columns,
+    pushed,
+)
 from jaxsid.mechanics.slots import Slots
 from jaxsid.records import SecondOrderModel
 
@@ -193,15 +200,15 @@ def _delayed(
     part = back - delay
     columns = jnp.concatenate([system.G, system.B], axis=1)
     ports = system.G.shape[1]
-    whole, one, two, _ = phi_columns(system.A, columns, part * dt)
+    whole, *moved = phi_columns(system.A, columns, part * dt)
     length = jnp.where(part > 0, part, 1.0)
     lines = late._replace(arrival=None)
-    value, change = jax.vmap(
-        lambda line: line_over_step(line._replace(arrival=late.arrival), 0.0 * part, length)
-    )(lines)
+    push = jax.vmap(lambda line: parabola_over_step(line._replace(arrival=late.arrival), 0.0 * part, length))(
+        lines
+    )
     # read so long after every sample, of which those are taken that lie far enough back
-    read = path.states @ (C @ whole) + path.mean_force @ (C @ one[:, :ports])
-    read = read + value @ (C @ one[:, ports:]) + change @ (C @ two[:, ports:])
+    read = path.states @ (C @ whole) + path.mean_force @ (C @ moved[0][:, :ports])
+    read = read + sum(x @ (C @ y[:, ports:]) for x, y in zip(push, pushed(moved, 1.0), strict=True))
     arrived = part >= late.arrival
     line = late.new + (part - late.arrival) * late.new_slope
     u = jnp.where(arrived, line, late.old + (part - late.arrival) * late.old_slope)

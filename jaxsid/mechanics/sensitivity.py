@@ -20,8 +20,8 @@ from jaxsid.mechanics.augmented import augmented
 from jaxsid.mechanics.dry_friction import friction, holding
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, Sorted, slips, sort_of
 from jaxsid.mechanics.effects.kind import Kind, Motion
-from jaxsid.mechanics.held_input import Late, line_over_step, value_at_sample
-from jaxsid.mechanics.integrate import moved_by, step_of
+from jaxsid.mechanics.held_input import Late, parabola_over_step, value_at_sample
+from jaxsid.mechanics.integrate import moved_by, pushed, step_of
 from jaxsid.mechanics.nonlinear import Scaled, held, scaled_inputs
 from jaxsid.mechanics.slots import Slots
 from jaxsid.records import SecondOrderModel
@@ -31,8 +31,8 @@ class LinearPart(NamedTuple):
     """All that a march needs of the linear part, or its slopes, with their directions as the last axis.
 
     Attributes:
-        step: (n + 9 slots, n + 2 inputs) from state and input's line: the state at the end, and what laws see at the
-            start, in the middle, at the end, without forces.
+        step: (n + 9 slots, n + 3 inputs) from state and input's parabola: the state at the end, and what laws see at
+            the start, in the middle, at the end, without forces.
         stages: (4, 3 slots, 8 slots) what forces of earlier stages do to what is seen at each.
         weights: (n, 8 slots) of the forces of all stages.
         rubs: (n, slots) what a mean force of dry friction does to the state.
@@ -43,7 +43,7 @@ class LinearPart(NamedTuple):
             forces over the interval and forces at its start.
         after: (outputs, 2 slots) likewise, from forces at its end.
         still: (outputs, n) readings of the state at once.
-        direct: (outputs, 3 inputs) likewise, from value and change of the inputs up to then, and their value then.
+        direct: (outputs, 4 inputs) likewise, from the inputs' parabola up to then, and their value then.
         offset: (outputs,) added to readings.
         part: (outputs,) of an interval, how long after the sample is read.
         back: (outputs,) how many intervals before.
@@ -108,8 +108,8 @@ def linear_part(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Arr
     )
     start, half, end = jnp.split(step.weights, 3, axis=1)
     speeds = system.seen[count : 2 * count]
-    whole, one, two = (jnp.einsum("on,onk->ok", system.C, x[2:]) for x in moved[:3])
-    direct = jnp.stack([one[:, ports:], two[:, ports:], system.D], axis=1)
+    whole, *read = (jnp.einsum("on,onk->ok", system.C, x[2:]) for x in moved)
+    direct = jnp.stack([*(x[:, ports:] for x in pushed(read, 1.0)), system.D], axis=1)
     now, after = (x[:, None] * system.F for x in (1 - part, part))
     gain = (1 + change.gain @ slots.sensors)[:, None]
     return LinearPart(
@@ -120,7 +120,7 @@ def linear_part(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Arr
         -speeds @ step.rubs,
         system.spring,
         speeds @ jnp.concatenate([system.A, system.B, system.G], axis=1),
-        gain * jnp.concatenate([whole, one[:, :ports], now], axis=1),
+        gain * jnp.concatenate([whole, read[0][:, :ports], now], axis=1),
         gain * after,
         gain * system.C,
         (gain[:, None] * direct).reshape(len(gain), -1),
@@ -266,8 +266,10 @@ def _substep(march: _March, row: _Row, i: Array, at: _At) -> _At:
     Z, sliding, mean, begun = at
     n, count = len(Z), len(laws.kinds)
     begin, length = i / march.substeps, 1 / jnp.asarray(march.substeps, Z.dtype)
-    line = _columns(lambda x: jnp.concatenate(line_over_step(_late(x), begin, length)), row.inputs, row.moved)
-    Y = _through(own.step, slopes.step, jnp.concatenate([Z, _wide(line, n)]))
+    push = _columns(
+        lambda x: jnp.concatenate(parabola_over_step(_late(x), begin, length)), row.inputs, row.moved
+    )
+    Y = _through(own.step, slopes.step, jnp.concatenate([Z, _wide(push, n)]))
     Z1, seen = Y[:n], Y[n:].reshape(3, 3 * count, *Z.shape[1:])
     if "law" in laws.kinds.sorts:
         F = _stages(march, seen, march.dt * (row.numbers + begin), march.dt * length)
@@ -329,10 +331,10 @@ def _direct(direct: Array, part: Array, inputs: Array) -> Float[Array, "samples 
     """What the inputs add to readings."""
 
     def of(direct: Array, part: Array, late: Late) -> Array:
-        value, change = line_over_step(late, 0.0 * part, jnp.where(part > 0, part, 1.0))
+        push = parabola_over_step(late, 0.0 * part, jnp.where(part > 0, part, 1.0))
         since = part - late.arrival
         now = jnp.where(since >= 0, late.new + since * late.new_slope, late.old + since * late.old_slope)
-        return direct @ jnp.concatenate([value, change, now])
+        return direct @ jnp.concatenate([*push, now])
 
     each = jax.vmap(of, in_axes=(0, 0, None))
     return jax.vmap(lambda lines: each(direct, part, _late(lines)))(inputs)
