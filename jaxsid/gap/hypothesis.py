@@ -135,11 +135,12 @@ def amplitudes_of(linear: SecondOrderModel, slots: Slots, moved: Sequence[Moved]
         slots: the places.
         moved: each record.
     """
+    # kinds do not count: one program for all
+    slots = eqx.tree_at(lambda s: s.kinds, slots, jnp.zeros(slots.count, jnp.int32))
     each = []
     for m in moved:
-        parts = (jnp.asarray(x) for x in (m.displacements, m.velocities, m.u, m.y))
-        q, v, u, y = parts
-        each.append(amplitudes(linear, slots, q, v, u, y, m.dt))
+        q, v, u, y, dt = (jnp.asarray(x) for x in (m.displacements, m.velocities, m.u, m.y, m.dt))
+        each.append(amplitudes(linear, slots, q, v, u, y, dt))
     mean = (
         np.sqrt(np.mean([np.asarray(x) ** 2 for x in field], axis=0)) for field in zip(*each, strict=True)
     )

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +23,7 @@ from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
-from jaxsid.gap.shooting import Products, Shot, parameters_of, products_of
+from jaxsid.gap.shooting import Products, Shot, products_of, told_parameters
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
@@ -451,17 +450,16 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
 def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Refit:
     elements, effects = len(bench.tolerance), hypothesis.effects
     theta = jnp.asarray(fit.theta)
-    rows = np.asarray(parameters_of(shot, theta, 0))
-    slopes = _slopes(shot, fit.theta)
+    every, slopes = map(np.asarray, told_parameters(shot, theta, bench.records))
+    rows = every[0]
     covariance = slopes @ fit.covariance @ slopes.T
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(rows.shape)
     found, deviations = [], []
     for row, effect in enumerate(effects):
         names = [p.name for p in CATALOGUE[effect.kind].parameters]
-        every = [np.asarray(parameters_of(shot, theta, i))[row] for i in range(bench.records)]
         own = np.asarray(shot.coordinates.per_record)[row]
         values = {
-            n: np.array([x[i] for x in every]) if own[i] and bench.records > 1 else float(rows[row, i])
+            n: every[:, row, i] if own[i] and bench.records > 1 else float(rows[row, i])
             for i, n in enumerate(names)
         }
         found.append(with_parameters(effect, values))
@@ -470,8 +468,3 @@ def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Re
     model = with_values(bench.model, jnp.asarray(nominal * (1 + fit.theta[:elements])))
     model = with_effects(model, found)
     return Refit(Hypothesis(tuple(found), hypothesis.wrong), fit, model, tuple(deviations), shot)
-
-
-def _slopes(shot: Shot, theta: np.ndarray) -> np.ndarray:
-    """(slots * most, p) of the first record's parameters."""
-    return np.asarray(jax.jacfwd(lambda t: parameters_of(shot, t, 0).ravel())(jnp.asarray(theta)))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsid.compilation import compiled_in_full
+from jaxsid.compilation import compiled, compiled_in_full
 from jaxsid.gap.hypothesis import Coordinates
 from jaxsid.gap.windows import Block
 from jaxsid.mechanics.effects.catalogue import Sorted
@@ -155,7 +155,27 @@ def parameters_of(shot: Shot, theta: Array, record: Array | int) -> Float[Array,
         theta: (p,) unknowns.
         record: number of the record.
     """
-    elements, coordinates = len(shot.directions[0]), shot.coordinates
+    return _parameters(shot.coordinates, len(shot.directions[0]), theta, record)
+
+
+def told_parameters(shot: Shot, theta: Array, records: int) -> tuple[Array, Array]:
+    """`parameters_of` every record, (records, slots, most), and slopes of the first one's, (slots * most, p).
+
+    Args:
+        shot: the hypothesis.
+        theta: (p,) unknowns.
+        records: how many.
+    """
+    return _told(shot.coordinates, len(shot.directions[0]), theta, records)
+
+
+@compiled
+def _told(coordinates: Coordinates, elements: int, theta: Array, records: int) -> tuple[Array, Array]:
+    every = jnp.stack([_parameters(coordinates, elements, theta, i) for i in range(records)])
+    return every, jax.jacfwd(lambda t: _parameters(coordinates, elements, t, 0).ravel())(theta)
+
+
+def _parameters(coordinates: Coordinates, elements: int, theta: Array, record: Array | int) -> Array:
     count = coordinates.centre.size
     z = theta[elements : elements + count].reshape(coordinates.centre.shape)
     further = theta[elements + count :].reshape(-1, len(coordinates.centre))

@@ -131,17 +131,25 @@ class _Sampled(NamedTuple):
 
 def _sampled_model(model: LumpedModel, dt: Array, hold: tuple[str, ...]) -> _Sampled:
     linear = second_order(model)
+    size = len(linear.mass)
+    plain, states = _driven(linear, jnp.asarray(dt), tuple("zero" if h == "band" else h for h in hold))
+    poles = jnp.asarray(np.linalg.eigvals(np.asarray(states.A)))
+    flexibility = jnp.asarray(np.linalg.pinv(np.asarray(linear.stiffness), rcond=FREE, hermitian=True))
+    return _Sampled(linear, plain, states, plain.B[size:], flexibility, poles, "band" in hold)
+
+
+@compiled
+def _driven(
+    linear: SecondOrderModel, dt: Array, hold: tuple[str, ...]
+) -> tuple[ContinuousModel, Realization]:
+    """Driven at every body, and the states driven by the inputs."""
     size, dtype = len(linear.mass), linear.mass.dtype
     every = eqx.tree_at(lambda s: s.input_matrix, linear, jnp.eye(size, dtype=dtype))
     plain = physical_displacement_velocity(every)
     eye = jnp.eye(2 * size, dtype=dtype)
     driven = plain.B @ linear.input_matrix
     # the states as outputs turn a first-order hold's shifted state into the plain one
-    sampled = tuple("zero" if h == "band" else h for h in hold)
-    states = discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=sampled)
-    poles = jnp.asarray(np.linalg.eigvals(np.asarray(states.A)))
-    flexibility = jnp.asarray(np.linalg.pinv(np.asarray(linear.stiffness), rcond=FREE, hermitian=True))
-    return _Sampled(linear, plain, states, plain.B[size:], flexibility, poles, "band" in hold)
+    return plain, discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=hold)
 
 
 @compiled

@@ -3,11 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsid.compilation import compiled
 from jaxsid.mechanics.effects.prior import Amplitudes
 from jaxsid.mechanics.slots import Slots, nominal_at
 from jaxsid.records import SecondOrderModel
 
 
+@compiled
 def amplitudes(
     linear: SecondOrderModel,
     slots: Slots,
