@@ -8,6 +8,7 @@ that FILE has and it has not, so that `run.py` goes on where another machine sto
 
 import argparse
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,17 +20,18 @@ WHOLE = ("verdict", "verdict_probability", "finding", "selected", "closure")
 EFFECT = ("kind", "place", "probability")
 LOCATION = ("together", "probability")
 FIRST = 10  # of effects and places
+ABOVE = re.compile(r'File "[^"]*/(?=(jaxsid|benchmarks|site-packages)/)')  # folders of one machine
 
 
 def scored(found: dict[str, Any]) -> dict[str, Any]:
-    """The part of a case's findings that is kept: a failure wholly, of a diagnosis what is scored.
+    """The part of a case's findings that is kept: a failure but for where files lay, of a diagnosis what is scored.
 
     Args:
         found: as `run.py` writes it.
     """
     said = found.get("diagnosis")
     if said is None:
-        return found
+        return {**found, "traceback": ABOVE.sub('File "', found.get("traceback", ""))}
     part = {k: said[k] for k in WHOLE if k in said}
     for name, keys in (("effects", EFFECT), ("locations", LOCATION)):
         part[name] = [{k: x[k] for k in keys if k in x} for x in (said.get(name) or [])[:FIRST]]
