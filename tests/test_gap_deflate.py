@@ -34,7 +34,12 @@ DELAY = effect("sensor_delay", "s1", delay=1.8 * DT)
 
 @pytest.mark.parametrize("followed", [False, True], ids=["in a run", "in windows"])
 @pytest.mark.parametrize(
-    ("effects", "late_by"), [((CUBIC,), 0), ((DELAY,), 2), ((DELAY, CUBIC), 2)], ids=["law", "signal", "both"]
+    ("effects", "late_by"),
+    [
+        pytest.param((CUBIC,), 0, id="law"),
+        pytest.param((DELAY,), 2, id="signal"),
+        pytest.param((DELAY, CUBIC), 2, id="both", marks=pytest.mark.slow),
+    ],
 )
 def test_what_effects_do_is_taken_out(effects, late_by, followed, monkeypatch):
     monkeypatch.setattr(module, "_followed", lambda bench: followed)

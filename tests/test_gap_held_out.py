@@ -69,6 +69,7 @@ def test_some_samples_always_stay(data):
     assert later_ends([data], [END], [np.nan * white(END)], [after]) == (END,)
 
 
+@pytest.mark.slow
 def test_what_comes_last_on_a_free_axis_is_seen_beside_its_drift():
     """It drifts away by far more, which a long simulation would take for what is left of the samples seen."""
     model = lumped_model(

@@ -33,7 +33,7 @@ def beside(r):
     return _leveled(fit.settings[0], fit.linear[0]), fit.linear[0]
 
 
-@pytest.mark.parametrize("pole", [0.0, 0.8])
+@pytest.mark.parametrize("pole", [0.0, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_the_power_is_found(pole):
     for seed in range(3):
         found = input_noise(*beside(measured(0.01, seed, pole=pole)))
@@ -50,7 +50,7 @@ def test_its_share_is_that_of_the_response_to_it():
     assert input_noise(setting, linear).share == pytest.approx(share, rel=0.1)
 
 
-@pytest.mark.parametrize("own", [0.01, 0.001])
+@pytest.mark.parametrize("own", [pytest.param(0.01, marks=pytest.mark.slow), 0.001])
 def test_nothing_is_common_without_it(own):
     """Also where sensors are far quieter than the input: then the fit must ask for it too."""
     before, after = [], []
@@ -109,7 +109,7 @@ def test_a_measured_drive_is_agreement():
     assert found.null.input_noise == pytest.approx([0.01], rel=0.15)
 
 
-@pytest.mark.parametrize("one", [False, True])
+@pytest.mark.parametrize("one", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_its_resonances_are_no_lone_frequency(one):
     """Of springs that are damped little: where noise of the input is not allowed for they are."""
     model = replace(chain(), damping=0.3 * chain().damping)
@@ -161,7 +161,7 @@ def test_one_sensor_tells_it_by_the_peaks_of_the_model():
     assert np.median([x.seen for x in found]) > CERTAIN
 
 
-@pytest.mark.parametrize("pole", [0.0, 0.9])
+@pytest.mark.parametrize("pole", [pytest.param(0.0, marks=pytest.mark.slow), 0.9])
 def test_one_sensor_tells_nothing_where_there_is_none(pole):
     """Its own noise, white or not, has no such peaks."""
     seen = []
@@ -173,11 +173,14 @@ def test_one_sensor_tells_nothing_where_there_is_none(pole):
     assert max(seen) < CERTAIN
 
 
-def test_one_sensor_and_a_measured_drive_are_agreement():
-    for seed in (0, 22, 24, 26, 31, 32):  # where laws were claimed as long as this noise was not allowed for
-        found = examine(chain(), [alone(measured(0.01, seed))])
-        assert found.finding == "agreement"
-        assert found.null.input_noise == pytest.approx([0.01], rel=0.35)
+# where laws were claimed as long as this noise was not allowed for
+@pytest.mark.parametrize(
+    "seed", [0, 22, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (24, 26, 31, 32))]
+)
+def test_one_sensor_and_a_measured_drive_are_agreement(seed):
+    found = examine(chain(), [alone(measured(0.01, seed))])
+    assert found.finding == "agreement"
+    assert found.null.input_noise == pytest.approx([0.01], rel=0.35)
 
 
 def alone(r):

@@ -16,7 +16,7 @@ from jaxsid.gap.explain import TEMPERATURE
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
 from jaxsid.gap.recalibrate import Recalibrated
-from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, MISSED, Verdict, concluded, verdict_of
+from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, MISSED, TWOFOLD, Verdict, concluded, verdict_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
@@ -193,6 +193,21 @@ def test_two_springs_at_one_place_imitate_one_of_another_shape():
     assert said(("quadratic_stiffness", B12), ("cubic_stiffness", B12)).name == "effect"
     assert said(("end_stop", B12), ("cubic_stiffness", B23)).name == "effect"
     assert said(("coulomb_friction", B12), ("cubic_stiffness", B12)).imitating == ()
+
+
+def test_two_laws_at_one_place_are_less_sure_than_at_two():
+    def unknown(*found):
+        rounds = [ranking(0.0, -500.0, kinds=[x, ("hysteresis", B23)]) for x in found]
+        verdict = verdict_of(examination(), causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
+        assert verdict.name == "effect"
+        return verdict.probability["unknown"]
+
+    friction = ("coulomb_friction", B12)
+    assert unknown(friction, ("cubic_stiffness", {"between": ("b2", "b1")})) == TWOFOLD
+    # another place, a polynomial, numbers of the model
+    assert unknown(friction, ("cubic_stiffness", B23)) < 2 * LAPSE
+    assert unknown(friction, ("damping_error", B12)) < 2 * LAPSE
+    assert unknown(("quadratic_stiffness", B12), ("cubic_stiffness", B12)) < 2 * LAPSE
 
 
 def test_springs_of_the_catalogue_are_curves_over_the_displacement():

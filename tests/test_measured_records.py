@@ -13,6 +13,7 @@ def identified(folder: Path):
     return jaxsid.identify(model, jaxsid.read_records(folder / "records.toml", model))
 
 
+@pytest.mark.slow
 def test_frame_whose_floors_were_measured_one_after_another(data: Path):
     """Peaks of the measured frequency responses: 3.17, 9.1, 13.43 Hz."""
     found = identified(data / "cambridge_frame")

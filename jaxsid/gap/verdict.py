@@ -11,7 +11,7 @@ from jaxsid.gap.closure import fraction, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.null import left_share
-from jaxsid.gap.ranking import LOUD, Explanation, ends_of
+from jaxsid.gap.ranking import ERRORS, LOUD, Explanation, ends_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 
 LIKELY = 0.9  # probability that the explanations named have together
@@ -21,8 +21,9 @@ SURE = 1.1  # what is left over the noise floor from which on that is so
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
 IMITATED = 0.6  # probability that two such springs at one place stand for one that is not in the catalogue
+TWOFOLD = 0.4  # likewise of any two laws at one place: that they stand for another, or one of them for what it lacks
 POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
-LAPSE = 0.08  # share of development cases in which what explains all and is far ahead of all else is not the truth
+LAPSE = 0.06  # share of development cases in which what explains all and is far ahead of all else is not the truth
 MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
@@ -70,8 +71,10 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if found.finding == "structure" and not causes.selected and _slight(found):
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
-    imitating = _imitating(causes.selected)
-    unexplained = max(_unexplained(causes, found.finding), IMITATED if imitating else 0.0)
+    pairs = _at_one_place(causes.selected)
+    imitating = _imitating(pairs)
+    paired = IMITATED if imitating else TWOFOLD if pairs else 0.0
+    unexplained = max(_unexplained(causes, found.finding), paired)
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
@@ -105,15 +108,24 @@ def _unexplained(causes: Causes, finding: str) -> float:
     return float(LAPSE + (1 - LAPSE - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
-def _imitating(selected: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
-    """Two springs that are not straight at one place: more often one curve of neither's shape than both at once."""
-    springs = [x for x in selected if CATALOGUE[x.kind].restoring]
-    pairs = (
+def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, Explanation]]:
+    """Two laws at one place that are not one polynomial; numbers of the model that are off there are no law."""
+    laws = [x for x in selected if x.kind not in ERRORS.values()]
+    return [
         (x, y)
-        for x, y in combinations(springs, 2)
+        for x, y in combinations(laws, 2)
         if ends_of(x.place) == ends_of(y.place) and {x.kind, y.kind} != POLYNOMIAL
-    )
-    return next(pairs, ())
+    ]
+
+
+def _imitating(pairs: list[tuple[Explanation, Explanation]]) -> tuple[Explanation, ...]:
+    """Two springs that are not straight: more often one curve of neither's shape than both at once.
+
+    Args:
+        pairs: at one place each.
+    """
+    springs = (pair for pair in pairs if all(CATALOGUE[x.kind].restoring for x in pair))
+    return next(springs, ())
 
 
 def _beside(causes: Causes) -> int:
