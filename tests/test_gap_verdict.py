@@ -16,7 +16,17 @@ from jaxsid.gap.explain import TEMPERATURE
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
 from jaxsid.gap.recalibrate import Recalibrated
-from jaxsid.gap.verdict import IMITATED, LAPSE, LOUD, MISSED, TWOFOLD, Verdict, concluded, verdict_of
+from jaxsid.gap.verdict import (
+    IMITATED,
+    LAPSE,
+    LOUD,
+    MISSED,
+    REMAINDER,
+    TWOFOLD,
+    Verdict,
+    concluded,
+    verdict_of,
+)
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
@@ -88,6 +98,26 @@ def test_effect():
     assert [[x.kind for x in likely] for likely in found.likely] == [["cubic_stiffness"]]
     assert found.probability["effect"] == pytest.approx(1 - LAPSE, abs=5e-3)
     assert sum(found.probability.values()) == pytest.approx(1)
+
+
+def test_an_effect_is_less_sure_where_tests_find_more_than_noise_in_what_it_leaves():
+    found = causes(ranking(0.0, -200.0), closures=[closure(0.0101)])
+    somewhere = found._replace(places=SimpleNamespace())
+    assert verdict_of(examination(), somewhere).probability["unknown"] == pytest.approx(REMAINDER, abs=5e-3)
+    # of numbers alone such tests ask nothing
+    numbers = examination()._replace(finding="parameters")
+    assert verdict_of(numbers, somewhere).probability["unknown"] == pytest.approx(LAPSE, abs=5e-3)
+
+
+def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_rest(monkeypatch):
+    monkeypatch.setattr("jaxsid.gap.verdict._beside", lambda found: 0)
+    idle = closure(0.99 * 0.3, floor=0.99 * 0.3)
+    assert idle.against_recalibrated == 1.0
+    found = causes(ranking(0.0, -200.0), closures=[idle])
+    assert verdict_of(examination(), found).name == "effect"  # all of it noise, as far as tests can tell
+    left, verdict = concluded(examination(), found._replace(places=SimpleNamespace()))
+    assert verdict.name == "unknown"
+    assert left.selected == ()
 
 
 def test_ambiguous_names_as_many_as_have_nine_tenths():

@@ -23,7 +23,9 @@ MOST = 0.5  # part of what was left that an effect beside an unknown one explain
 IMITATED = 0.6  # probability that two such springs at one place stand for one that is not in the catalogue
 TWOFOLD = 0.4  # likewise of any two laws at one place: that they stand for another, or one of them for what it lacks
 POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
-LAPSE = 0.06  # share of development cases in which what explains all and is far ahead of all else is not the truth
+LAPSE = 0.04  # share of development cases in which what explains all and is far ahead of all else is not the truth
+REMAINDER = 0.25  # likewise where tests still find more than noise in what it leaves
+HARDLY, USELESS = 0.9, 0.75  # likewise where that is more than this part of what the best linear model leaves
 MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
@@ -102,10 +104,15 @@ def _unexplained(causes: Causes, finding: str) -> float:
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1 - MISSED
     # what comes nearest to a law that is not there explains most of its gap, but not to the noise
-    more = finding == "structure" and last.after > SURE * last.noise_floor
+    structure = finding == "structure"
+    more = structure and last.after > SURE * last.noise_floor
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
-    return float(LAPSE + (1 - LAPSE - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
+    lapse = LAPSE
+    if structure and causes.places is not None:
+        # noise whose level is not told takes up what no law explains, so that nearly all seems gone
+        lapse = USELESS if last.after > HARDLY * last.recalibrated else REMAINDER
+    return float(lapse + max(0.0, 1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
 def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, Explanation]]:
