@@ -109,7 +109,7 @@ def _unexplained(causes: Causes, finding: str) -> float:
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     lapse = LAPSE
-    if structure and causes.places is not None:
+    if structure and not more and causes.places is not None:
         # noise whose level is not told takes up what no law explains, so that nearly all seems gone
         lapse = USELESS if last.after > HARDLY * last.recalibrated else REMAINDER
     return float(lapse + max(0.0, 1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
