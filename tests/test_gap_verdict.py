@@ -115,9 +115,14 @@ def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_r
     assert idle.against_recalibrated == 1.0
     found = causes(ranking(0.0, -200.0), closures=[idle])
     assert verdict_of(examination(), found).name == "effect"  # all of it noise, as far as tests can tell
-    left, verdict = concluded(examination(), found._replace(places=SimpleNamespace()))
+    guess, told = (Noise(np.ones(3), np.ones((3, 1)), degrees, "residual") for degrees in (0.0, 500.0))
+    somewhere = found._replace(places=SimpleNamespace(), noises=(guess,))
+    left, verdict = concluded(examination(), somewhere)
     assert verdict.name == "unknown"
     assert left.selected == ()
+    # noise that is known takes up nothing
+    known = somewhere._replace(noises=(told,))
+    assert verdict_of(examination(), known).probability["unknown"] == pytest.approx(REMAINDER, abs=5e-3)
 
 
 def test_ambiguous_names_as_many_as_have_nine_tenths():

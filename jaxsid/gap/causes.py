@@ -95,9 +95,14 @@ class Causes(NamedTuple):
     later: tuple[int, ...]
 
     @property
+    def bounded(self) -> bool:
+        """Whether the noise is guessed and tests find more than noise in what is left: it is no more than that."""
+        return self.places is not None and any(n.degrees <= 0 for n in self.noises)
+
+    @property
     def most(self) -> str:
-        """Words before a figure of the noise, where that is guessed and tests find more than noise in what is left."""
-        return "at most " if self.places is not None and any(n.degrees <= 0 for n in self.noises) else ""
+        """Words before a figure of the noise."""
+        return "at most " if self.bounded else ""
 
     def first(self, count: int) -> "Causes":
         """The same with the first effects only; with the best linear model where there are none.

@@ -110,8 +110,9 @@ def _unexplained(causes: Causes, finding: str) -> float:
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     lapse = LAPSE
     if structure and not more and causes.places is not None:
-        # noise whose level is not told takes up what no law explains, so that nearly all seems gone
-        lapse = USELESS if last.after > HARDLY * last.recalibrated else REMAINDER
+        # noise whose level is guessed takes up what no law explains, so that nearly all seems gone
+        idle = causes.bounded and last.after > HARDLY * last.recalibrated
+        lapse = USELESS if idle else REMAINDER
     return float(lapse + max(0.0, 1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
