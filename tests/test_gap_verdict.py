@@ -101,12 +101,19 @@ def test_effect():
 
 
 def test_an_effect_is_less_sure_where_tests_find_more_than_noise_in_what_it_leaves():
-    found = causes(ranking(0.0, -200.0), closures=[closure(0.0101)])
-    somewhere = found._replace(places=SimpleNamespace())
-    assert verdict_of(examination(), somewhere).probability["unknown"] == pytest.approx(REMAINDER, abs=5e-3)
+    def unknown(after, floor, places):
+        found = causes(ranking(0.0, -200.0), closures=[closure(after, floor=floor)])._replace(places=places)
+        return verdict_of(examination(), found).probability["unknown"]
+
+    somewhere = SimpleNamespace()
+    assert unknown(0.15, 0.149, None) == pytest.approx(LAPSE, abs=5e-3)
+    assert unknown(0.15, 0.149, somewhere) == pytest.approx(REMAINDER, abs=5e-3)
+    # next to nothing is left
+    assert unknown(0.0101, 0.01, somewhere) == pytest.approx(LAPSE, abs=5e-3)
     # of numbers alone such tests ask nothing
     numbers = examination()._replace(finding="parameters")
-    assert verdict_of(numbers, somewhere).probability["unknown"] == pytest.approx(LAPSE, abs=5e-3)
+    found = causes(ranking(0.0, -200.0), closures=[closure(0.15, floor=0.149)])._replace(places=somewhere)
+    assert verdict_of(numbers, found).probability["unknown"] == pytest.approx(LAPSE, abs=5e-3)
 
 
 def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_rest(monkeypatch):

@@ -24,8 +24,10 @@ IMITATED = 0.6  # probability that two such springs at one place stand for one t
 TWOFOLD = 0.4  # likewise of any two laws at one place: that they stand for another, or one of them for what it lacks
 POLYNOMIAL = {"quadratic_stiffness", "cubic_stiffness"}  # two that are one law, of a curve that is not even
 LAPSE = 0.04  # share of development cases in which what explains all and is far ahead of all else is not the truth
-REMAINDER = 0.25  # likewise where tests still find more than noise in what it leaves
-HARDLY, USELESS = 0.9, 0.75  # likewise where that is more than this part of what the best linear model leaves
+# likewise where tests find more than noise in what it leaves, and that is more than this part of what the best linear
+# model does
+SHRUNK, REMAINDER = 0.25, 0.35
+HARDLY, USELESS = 0.9, 0.75
 MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
@@ -109,7 +111,7 @@ def _unexplained(causes: Causes, finding: str) -> float:
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
     lapse = LAPSE
-    if structure and not more and causes.places is not None:
+    if structure and not more and causes.places is not None and last.after > SHRUNK * last.recalibrated:
         # noise whose level is guessed takes up what no law explains, so that nearly all seems gone
         idle = causes.bounded and last.after > HARDLY * last.recalibrated
         lapse = USELESS if idle else REMAINDER
