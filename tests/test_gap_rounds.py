@@ -104,6 +104,24 @@ def test_a_spring_comes_before_a_law_that_hardly_differs_from_it():
     assert found.gain == pytest.approx((-unit + 1e4) / TEMPERATURE)
 
 
+def test_what_was_fitted_to_a_part_alone_never_comes_first():
+    stop, spring = candidate("end_stop", B12), candidate("missing_connection", B23)
+    bench = BENCH._replace(blocks=(None, None))
+    states = lambda count: (np.zeros((1, 2)),) * count  # noqa: E731
+
+    def first(blocks):
+        fits = [refit(0.0), refit(-1.0)]
+        fits = [
+            x._replace(fit=x.fit._replace(states=states(n))) for x, n in zip(fits, (2, blocks), strict=True)
+        ]
+        every = [(c, x, x.fit.evidence, 1.0) for c, x in zip((stop, spring), fits, strict=True)]
+        return ranked(every, refit(-1e4), bench, TEMPERATURE).ranked[0]
+
+    assert first(2).kind == "missing_connection"
+    assert first(1).kind == "end_stop"
+    assert len(first(1).refit.fit.states) == 2
+
+
 def test_springs_are_candidates_where_the_model_joins_nothing():
     laws = [candidate("end_stop", B13), candidate("end_stop", B12), candidate("sensor_lag", {"sensor": "s1"})]
     assert [(c.kind, c.place) for c in _connections(chain(), laws)] == [("missing_connection", B13)]
@@ -114,6 +132,7 @@ def test_springs_are_candidates_where_the_model_joins_nothing():
     [
         ("end_stop", [0.0, -30.0, -10.0], [1]),  # a spring near a stop at its place
         ("end_stop", [0.0, -50.0, -10.0], []),  # far from it
+        ("end_stop", [0.0, -50.0, -0.9 * STRAIGHT], [2]),  # one elsewhere, that would come before the stop
         ("missing_connection", [-10.0, 0.0, -10.0], []),  # the spring is the best one
     ],
 )

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from jaxsid.gap.nested import nested
 from jaxsid.gap.ranking import (
     ERRORS,
+    STRAIGHT,
     Explanation,
     Key,
     Ranking,
@@ -333,7 +334,7 @@ def _round(
 def _due(
     rough: Sequence[tuple[Candidate, Refit]], values: Sequence[float], done: Mapping[int, Whole], near: float
 ) -> list[int]:
-    """What must still be fitted thoroughly: the best one, then springs and dampers where it acts."""
+    """What must still be fitted thoroughly: the best one, then springs and dampers where it acts, or nearly as good."""
     if not rough or not math.isfinite(max(values)):
         return []
     best = int(np.argmax(values))
@@ -342,8 +343,9 @@ def _due(
     at, top = rough[best][0], values[best]
     if straight(at.kind):
         return []
-    here = (i for i, (c, _) in enumerate(rough) if i not in done and ends_of(c.place) == ends_of(at.place))
-    return [i for i in here if straight(rough[i][0].kind) and top - values[i] < near]
+    plain = [(i, c) for i, (c, _) in enumerate(rough) if i not in done and straight(c.kind)]
+    reach = {i: near if ends_of(c.place) == ends_of(at.place) else STRAIGHT / CLOSE * near for i, c in plain}
+    return [i for i in reach if top - values[i] < reach[i]]
 
 
 def _roughly(

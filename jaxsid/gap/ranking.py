@@ -302,7 +302,9 @@ def ranked(
     first = max(every, key=lambda x: x[2])[1].fit if every else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
     values = np.array([x[2] for x in every] + [without.fit.evidence]) / scale / temperature
-    values[:-1] += [STRAIGHT * straight(x[0].kind) for x in every]
+    # what was fitted to a part of the records alone is no better than what was fitted to all
+    whole = len(bench.blocks)
+    values[:-1] += [STRAIGHT * (straight(c.kind) and len(r.fit.states) == whole) for c, r, *_ in every]
     order = np.argsort(-values[:-1], kind="stable")
     every = [every[i] for i in order]
     weights = np.exp(values - values.max())
