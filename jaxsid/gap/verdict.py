@@ -27,8 +27,6 @@ LAPSE = 0.04  # share of development cases in which what explains all and is far
 # likewise where tests find more than noise in what it leaves, and that is over so much of what the linear model does
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
-# likewise over less, but surely more than a trace next to it
-SURELY, TRACE, TRACED = 1e-6, 0.005, 0.6
 MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
@@ -111,22 +109,12 @@ def _unexplained(causes: Causes, finding: str) -> float:
     more = structure and last.after > SURE * last.noise_floor
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
-    lapse = _lapse(causes, more) if structure and causes.places is not None else LAPSE
+    lapse = LAPSE
+    if structure and not more and causes.places is not None and last.after > SHRUNK * last.recalibrated:
+        # noise whose level is guessed takes up what no law explains, so that nearly all seems gone
+        idle = causes.bounded and last.after > HARDLY * last.recalibrated
+        lapse = USELESS if idle else REMAINDER
     return float(lapse + (1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
-
-
-def _lapse(causes: Causes, more: bool) -> float:
-    """Probability that a law which seems to explain all is not the truth, where tests find more than noise beside it.
-
-    Noise whose level is guessed takes up what no law explains, so that nearly all seems gone.
-    """
-    last = causes.closures[-1]
-    if last.after <= SHRUNK * last.recalibrated:
-        left = causes.remaining
-        return TRACED if left.p_value < SURELY and left.share > TRACE * last.recalibrated else LAPSE
-    if more:
-        return LAPSE
-    return USELESS if causes.bounded and last.after > HARDLY * last.recalibrated else REMAINDER
 
 
 def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, Explanation]]:
