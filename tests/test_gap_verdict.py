@@ -27,6 +27,7 @@ from jaxsid.gap.verdict import (
     concluded,
     verdict_of,
 )
+from jaxsid.gap.words import about_doubt
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
@@ -262,6 +263,22 @@ def test_two_laws_at_one_place_are_less_sure_than_at_two():
     assert unknown(friction, ("cubic_stiffness", B23)) < 2 * LAPSE
     assert unknown(friction, ("damping_error", B12)) < 2 * LAPSE
     assert unknown(("quadratic_stiffness", B12), ("cubic_stiffness", B12)) < 2 * LAPSE
+
+
+def test_doubt_of_an_effect_has_a_reason():
+    said = lambda found: about_doubt(found, verdict_of(examination(), found))  # noqa: E731
+    kinds = ("coulomb_friction", "cubic_stiffness")
+    rounds = [ranking(0.0, -500.0, kinds=[(k, B12), ("hysteresis", B23)]) for k in kinds]
+    (pair,) = said(causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
+    assert "probability of 0.40" in pair
+    assert "coulomb friction and cubic stiffness between b1 and b2" in pair
+    (rest,) = said(causes(ranking(0.0, -200.0), closures=[closure(0.045)]))
+    assert "leaves 4.5 % of the samples that were not used" in rest
+    assert "linear model leaves 30 % and noise alone 1 %" in rest
+    # nothing to explain: sure of it, or unknown, which the summary says
+    assert said(causes(ranking(0.0, -200.0), closures=[closure(0.0101)])) == []
+    assert said(causes(ranking(0.0, -200.0), closures=[closure(0.25)])) == []
+    assert about_doubt(None, verdict_of(examination(0.4, 0.6), None)) == []
 
 
 def test_springs_of_the_catalogue_are_curves_over_the_displacement():

@@ -38,12 +38,14 @@ class Verdict(NamedTuple):
         probability: of none, of an effect of the catalogue, of one that is not in it.
         likely: for each effect that was found, the explanations that are not told apart, most probable first.
         imitating: effects of the catalogue that together look like one that is not in it.
+        paired: two laws at one place, where that is the most likely reason why none of the catalogue would be right.
     """
 
     name: str
     probability: dict[str, float]
     likely: tuple[tuple[Explanation, ...], ...]
     imitating: tuple[Explanation, ...] = ()
+    paired: tuple[Explanation, ...] = ()
 
 
 def concluded(found: Examination, causes: Causes | None) -> tuple[Causes | None, Verdict]:
@@ -76,14 +78,15 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     pairs = _at_one_place(causes.selected)
     imitating = _imitating(pairs)
-    paired = IMITATED if imitating else TWOFOLD if pairs else 0.0
-    unexplained = max(_unexplained(causes, found.finding), paired)
+    unexplained, twofold = _unexplained(causes, found.finding), IMITATED if imitating else TWOFOLD
+    paired = pairs[0] if pairs and twofold > unexplained else ()
+    unexplained = twofold if paired else unexplained
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
         return Verdict("unknown", probability, likely, imitating)
     open_ones = any(len(x) > 1 for x in likely)
-    return Verdict("ambiguous" if open_ones else "effect", probability, likely)
+    return Verdict("ambiguous" if open_ones else "effect", probability, likely, paired=paired)
 
 
 def _slight(found: Examination) -> bool:

@@ -18,6 +18,7 @@ TELLS = 10.0  # log evidence below which an experiment is of no use
 PARTS = 0.01  # of a body's motion that a sensor is worth asking for
 NAMED = 6  # numbers that are off
 BY_ITSELF = "What enters by a sensor of its own: it tells an error of the input from all else."
+DOUBTED = 0.1  # probability of what is not in the catalogue from which on its reason is said
 APART = 1.5  # gap in noise from which on refitted numbers are worth a word
 
 
@@ -129,6 +130,31 @@ def summary(found: Found) -> tuple[str, str]:
         others = ", ".join(named(x) for likely in found.judgement.likely for x in likely[1:])
         return f"{what[0].upper()}{what[1:]}. These records cannot tell it from {others}.", shrinks
     return f"{what[0].upper()}{what[1:]}.", shrinks
+
+
+def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
+    """Why effects that were found are not sure, where that is for what the catalogue does not hold.
+
+    Args:
+        causes: what was found.
+        verdict: what is concluded of it.
+    """
+    unknown = verdict.probability["unknown"]
+    if causes is None or not causes.selected or verdict.name == "unknown" or unknown < DOUBTED:
+        return []
+    doubt = f"A probability of {unknown:.2f} is left for what the catalogue does not hold:"
+    if verdict.paired:
+        both = " and ".join(map(kind_words, (x.kind for x in verdict.paired)))
+        where = place_words(verdict.paired[0].place)
+        return [
+            f"{doubt} two laws at one place, {both} {where}, may stand for a single one of another shape."
+        ]
+    closure = causes.closures[-1]
+    return [
+        f"{doubt} what was found leaves {percent(closure.after)} of the samples that were not used, where the best "
+        f"linear model leaves {percent(closure.recalibrated)} and noise alone {causes.most}"
+        f"{percent(closure.noise_floor)}."
+    ]
 
 
 def about_numbers(found: Examination) -> list[str]:
