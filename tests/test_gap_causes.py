@@ -254,6 +254,28 @@ def test_beside_a_law_numbers_are_ranked_only_where_a_quick_fit_of_one_hints_at_
     assert ranked_ones == [off]
 
 
+def test_a_number_under_which_the_motion_grows_without_bound_is_refused(monkeypatch):
+    """As a whole fit of it may, with a law of the wrong sign, though its windows alone do not."""
+    off = candidate("stiffness_error", B12)
+    much = ranking(0.0, without=-1e4, kinds=[("stiffness_error", B12)])
+    monkeypatch.setattr(module, "numbers_off", lambda *_: (off,))
+    monkeypatch.setattr(module, "hint", lambda *_: 2 * TELLING)
+    monkeypatch.setattr(module, "rank", lambda *_: much)
+    monkeypatch.setattr(module, "_reconsidered", lambda at, *_: at)
+    monkeypatch.setattr(module, "looked", lambda *_: LOOKED)
+    first = ranking(-5.0).ranked[:1]
+    at = _Found(BENCH, SimpleNamespace(scored="places"), (ranking(-5.0),), first, refit(-5.0))
+    for evidence, named in ((0.0, ["cubic_stiffness", "stiffness_error"]), (-np.inf, ["cubic_stiffness"])):
+
+        def taken(at, of, evidence=evidence):
+            return at._replace(selected=(*at.selected, of.ranked[0]), before=refit(evidence))
+
+        monkeypatch.setattr(_Found, "taken", taken)
+        found = _numbers(at, (), chain(), (), lambda text: None)
+        assert [x.kind for x in found.selected] == named
+        assert found.holds
+
+
 # effects asked again
 
 LOOKED, AGAIN = SimpleNamespace(clear=True), SimpleNamespace(clear=True)

@@ -401,6 +401,10 @@ def test_noise_is_what_a_fit_leaves_and_a_search_begins_with_the_guess():
     np.testing.assert_array_equal(back.blocks[0].weight, frozen.blocks[0].weight)
     np.testing.assert_array_equal(back.blocks[0].taps, frozen.blocks[0].taps)
     assert back.jump == np.inf
+    # a motion that grows without bound tells nothing of it
+    lost = refitted(frozen, Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=-1e9),)))
+    assert lost.fit.evidence == -np.inf
+    assert weighed_anew(frozen, lost) is frozen
     # noise that something else tells of stays as it is
     sure = bench(y, level)
     assert as_guessed(sure) is sure

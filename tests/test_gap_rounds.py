@@ -228,7 +228,13 @@ def test_laws_where_what_is_left_most_probably_arises_are_tried_early(monkeypatc
 def searched(monkeypatch):
     """An effect with another that is hardly told from it; what is found beside either."""
 
-    def run(evidences=(0.0, -TEMPERATURE, -40 * TEMPERATURE), clear=False, beside=("end_stop",), whole=True):
+    def run(
+        evidences=(0.0, -TEMPERATURE, -40 * TEMPERATURE),
+        clear=False,
+        beside=("end_stop",),
+        whole=True,
+        last=0.0,
+    ):
         first = ranking(*evidences)
         bench = BENCH if whole else BENCH._replace(blocks=(SimpleNamespace(),))
         first = first._replace(bench=bench)
@@ -237,8 +243,7 @@ def searched(monkeypatch):
         at = origin._replace(look=look, rounds=(first,), selected=first.ranked[:1], before=refit(0.0))
 
         def taken(self, of):
-            best = of.ranked[0]
-            return self._replace(rounds=(of,), selected=(*self.selected, best), before=best.refit)
+            return self._replace(rounds=(of,), selected=(*self.selected, of.ranked[0]), before=refit(last))
 
         def further(other, candidates, *_):
             kinds = [k for k in beside if other.selected[0].kind == "backlash"]
@@ -271,6 +276,7 @@ def test_what_is_hardly_told_apart_is_tried_where_nothing_more_is_found(searched
         {"evidences": (0.0, -40 * TEMPERATURE)},  # nothing is like it
         {"beside": ()},  # nothing more is found beside the other either
         {"whole": False},  # the other was fitted to a part of the records only
+        {"last": -np.inf},  # with the other the motion grows without bound
     ],
 )
 def test_else_the_first_effect_stays(searched, case):
@@ -432,13 +438,14 @@ def test_the_best_law_stays_where_simpler_ones_leave_much_more(simpler):
 def taken(monkeypatch):
     """What is taken of a round that Stribeck's law won, where more is left and simpler laws are as told."""
 
-    def run(plain, clear=False, selected=()):
+    def run(plain, clear=False, selected=(), diverging=()):
         first = misfit((*STRIBECK, 11.5))
         look = SimpleNamespace(clear=clear)
 
         def take(self, of):
             best = of.ranked[0]
-            return self._replace(rounds=(of,), selected=(*self.selected, best), before=best.refit)
+            last = refit(-np.inf) if best.kind in diverging else best.refit
+            return self._replace(rounds=(of,), selected=(*self.selected, best), before=last)
 
         monkeypatch.setattr(_Found, "taken", take)
         monkeypatch.setattr(causes, "looked", lambda *_: look)
@@ -456,6 +463,15 @@ def test_the_simpler_law_is_taken_in_place_of_the_best_one(taken):
     plain = misfit(("coulomb_friction", B12, 0.0, 12.0), (*STRIBECK, 11.5))
     assert [x.kind for x in taken(plain)[1].selected] == ["coulomb_friction"]
     assert [x.kind for x in taken(plain, clear=True)[1].selected] == ["stribeck_friction"]
+
+
+def test_laws_under_which_the_motion_grows_without_bound_are_not_taken(taken):
+    plain = misfit(("coulomb_friction", B12, 0.0, 12.0), (*STRIBECK, 11.5))
+    assert [x.kind for x in taken(plain, diverging=("coulomb_friction",))[1].selected] == [
+        "stribeck_friction"
+    ]
+    at, found = taken(plain, diverging=("stribeck_friction",))
+    assert (found.selected, found.before) == (at.selected, at.before) == ((), None)
 
 
 def test_the_best_law_has_its_probability_beside_simpler_ones(taken):

@@ -213,6 +213,11 @@ class _Found(NamedTuple):
     selected: tuple[Explanation, ...]
     before: Refit | None
 
+    @property
+    def holds(self) -> bool:
+        """Whether the last fit is one: under what was found last the motion may grow without bound."""
+        return self.before is not None and bool(np.isfinite(self.before.fit.evidence))
+
     def taken(self, ranking: Ranking) -> "_Found":
         """With the best of a round, fitted to the very bottom, its noise what is left there."""
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
@@ -305,10 +310,11 @@ def _elsewhere(
     anew = elsewhere(once, first, origin.before, FIRST, say)
     if anew is once:
         return at
-    at = _left(origin.taken(anew), model, seen)
-    if at.look.clear:
-        return at
-    return _further(at, to_try(at.look, first), FURTHER, model, seen, say)
+    new = origin.taken(anew)
+    new = _left(new, model, seen) if new.holds else at
+    if new is at or new.look.clear:
+        return new
+    return _further(new, to_try(at.look, first), FURTHER, model, seen, say)
 
 
 def _otherwise(
@@ -327,8 +333,10 @@ def _otherwise(
     if y is None:
         return at
     say(f"{y.kind} in place of {best.kind}")
-    others = tuple(x for x in ranking.ranked if x is not y)
-    other = _left(origin.taken(ranking._replace(ranked=(y, *others))), model, seen)
+    other = origin.taken(ranking._replace(ranked=(y, *(x for x in ranking.ranked if x is not y))))
+    if not other.holds:
+        return at
+    other = _left(other, model, seen)
     further = _further(other, to_try(other.look, first), FURTHER, model, seen, say)
     return further if len(further.selected) > len(at.selected) else at
 
@@ -346,7 +354,7 @@ def _further(
     if not ranking.ranked or not worth(ranking, LEAST if at.selected else _least(at.look)):
         return at.refused(ranking)
     found = at.taken(ranking)
-    if not found.selected[-1].told:
+    if not (found.holds and found.selected[-1].told):
         return at.refused(ranking)
     say("what is left")
     found = _left(found, model, seen)
@@ -359,7 +367,8 @@ def _further(
         last = found.selected[-1]._replace(probability=plain.ranked[0].probability)
         return found._replace(rounds=(*found.rounds[:-1], plain), selected=(*found.selected[:-1], last))
     say("what is left")
-    return _left(at.taken(plain), model, seen)
+    other = at.taken(plain)
+    return _left(other, model, seen) if other.holds else found
 
 
 def _left(at: _Found, model: LumpedModel, seen: Sequence[Record]) -> _Found:
@@ -415,7 +424,8 @@ def _turn(
         rounds[i] = ranking
         selected[i] = x._replace(probability=ranking.ranked[0].probability)
         return at._replace(rounds=tuple(rounds), selected=tuple(selected)), False
-    return _in_place(at, i, ranking), True
+    new = _in_place(at, i, ranking)
+    return (new, True) if new.holds else (at, False)
 
 
 def _without(at: _Found, x: Explanation, model: LumpedModel) -> tuple[Refit, tuple[np.ndarray, ...]]:
@@ -466,10 +476,11 @@ def _numbers(
         # the number farthest off, what the model lacks, the others
         candidates = (*off[:1], *lacking, *off[1:])
         ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
-        if ranking.gain <= least:
+        found = at.taken(ranking) if ranking.gain > least else at
+        if found is at or not found.holds:
             at = at.refused(ranking)
             break
-        at = at.taken(ranking)
+        at = found
     if begun and len(at.selected) > begun:
         say("what is left")
         at = _reconsidered(_left(at, model, seen), model, seen, say)

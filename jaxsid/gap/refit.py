@@ -213,13 +213,14 @@ def _substeps(model: LumpedModel, dt: float) -> int:
 def weighed_anew(bench: Bench, found: Refit) -> Bench:
     """The bench with level and colour of the noise from what a fit leaves, where nothing else tells of it.
 
-    Windows of few samples take up part of the noise themselves and tell nothing of it.
+    Windows of few samples take up part of the noise themselves and tell nothing of it, nor does a motion that grows
+    without bound.
 
     Args:
         bench: records.
         found: a fit to all of it.
     """
-    if np.isfinite(bench.loose):
+    if np.isfinite(bench.loose) or not np.isfinite(found.fit.evidence):
         return bench
     lefts = [np.asarray(x.left) for x in in_windows(bench, found)]
     noises = list(bench.noises)
