@@ -272,6 +272,10 @@ def test_doubt_of_an_effect_has_a_reason():
     (pair,) = said(causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
     assert "probability of 0.40" in pair
     assert "coulomb friction and cubic stiffness between b1 and b2" in pair
+    load, friction = ("constant_load", {"body": "b1"}), ("coulomb_friction", {"between": ("ground", "b1")})
+    rounds = [ranking(0.0, -500.0, kinds=[x, ("hysteresis", B23)]) for x in (load, friction)]
+    (pair,) = said(causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
+    assert "constant load and coulomb friction between ground and b1" in pair
     (rest,) = said(causes(ranking(0.0, -200.0), closures=[closure(0.045)]))
     assert "leaves 4.5 % of the samples that were not used" in rest
     assert "linear model leaves 30 % and noise alone 1 %" in rest

@@ -144,8 +144,9 @@ def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
         return []
     doubt = f"A probability of {unknown:.2f} is left for what the catalogue does not hold:"
     if verdict.paired:
-        both = " and ".join(map(kind_words, (x.kind for x in verdict.paired)))
-        where = place_words(verdict.paired[0].place)
+        both = " and ".join(kind_words(x.kind) for x in verdict.paired)
+        # a force on a body acts between it and the ground
+        where = place_words(max((x.place for x in verdict.paired), key=lambda place: "between" in place))
         return [
             f"{doubt} two laws at one place, {both} {where}, may stand for a single one of another shape."
         ]
