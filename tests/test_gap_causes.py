@@ -163,6 +163,19 @@ def test_no_effect_at_all_is_an_alternative_too():
     assert _values([], {}, BENCH, BENCH) == []
 
 
+@pytest.mark.parametrize("without", [-1e4, -np.inf])
+def test_candidates_under_which_the_motion_grows_without_bound_are_worth_nothing(without):
+    with np.errstate(invalid="raise", divide="raise"):
+        lost = ranking(-np.inf, -np.inf, without=without, squares=np.inf)
+        assert lost.gain == 0.0
+        assert sum(x.probability for x in lost.ranked) <= 1
+        assert math.isfinite(lost.scale)
+        one = ranking(-np.inf, -500.0, without=without)
+    assert [x.kind for x in one.ranked] == ["backlash", "cubic_stiffness"]
+    assert one.ranked[0].probability == pytest.approx(1.0)
+    assert one.gain > WORTH
+
+
 def test_alike_are_those_that_tempered_evidence_hardly_tells_apart():
     found = ranking(0.0, -2.9 * TEMPERATURE, -3.1 * TEMPERATURE)
     first, second, third = found.ranked

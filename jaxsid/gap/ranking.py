@@ -79,10 +79,11 @@ class Ranking(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Tempered evidence of the best one over that of none of them; 0 where there is none."""
-        if not self.ranked:
+        """Tempered evidence of the best one over that of none of them; 0 where there is none whose fit holds."""
+        best = self.ranked[0].evidence if self.ranked else -math.inf
+        if not math.isfinite(best):
             return 0.0
-        return (self.ranked[0].evidence - self.without.fit.evidence) / self.scale / self.temperature
+        return (best - self.without.fit.evidence) / self.scale / self.temperature
 
 
 def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
@@ -299,15 +300,18 @@ def ranked(
         bench: of the best one.
         temperature: of the round.
     """
-    first = max(every, key=lambda x: x[2])[1].fit if every else without.fit
+    # motions that grow without bound leave nothing to compare by
+    held = [x for x in every if math.isfinite(x[2])]
+    first = max(held, key=lambda x: x[2])[1].fit if held else without.fit
     scale = max(first.squares / max(first.equations, 1), np.finfo(float).tiny)
+    scale = scale if math.isfinite(scale) else 1.0
     values = np.array([x[2] for x in every] + [without.fit.evidence]) / scale / temperature
     # what was fitted to a part of the records alone is no better than what was fitted to all
     whole = len(bench.blocks)
     values[:-1] += [STRAIGHT * (straight(c.kind) and len(r.fit.states) == whole) for c, r, *_ in every]
     order = np.argsort(-values[:-1], kind="stable")
     every = [every[i] for i in order]
-    weights = np.exp(values - values.max())
+    weights = np.exp(values - values.max()) if np.isfinite(values.max()) else np.ones_like(values)
     weights = weights[[*order, -1]] / weights.sum()
     return Ranking(
         tuple(
