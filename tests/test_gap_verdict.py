@@ -277,7 +277,7 @@ def test_doubt_of_an_effect_has_a_reason():
     (pair,) = said(causes(*rounds, closures=[closure(0.05), closure(0.0101)]))
     assert "constant load and coulomb friction between ground and b1" in pair
     (rest,) = said(causes(ranking(0.0, -200.0), closures=[closure(0.045)]))
-    assert "leaves 4.5 % of the samples that were not used" in rest
+    assert "leaves 4.5 % on samples that were not used" in rest
     assert "linear model leaves 30 % and noise alone 1 %" in rest
     # nothing to explain: sure of it, or unknown, which the summary says
     assert said(causes(ranking(0.0, -200.0), closures=[closure(0.0101)])) == []

@@ -152,7 +152,7 @@ def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
         ]
     closure = causes.closures[-1]
     return [
-        f"{doubt} what was found leaves {percent(closure.after)} of the samples that were not used, where the best "
+        f"{doubt} what was found leaves {percent(closure.after)} on samples that were not used, where the best "
         f"linear model leaves {percent(closure.recalibrated)} and noise alone {causes.most}"
         f"{percent(closure.noise_floor)}."
     ]
