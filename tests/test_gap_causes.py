@@ -363,6 +363,14 @@ def test_another_effect_takes_its_place(two):
     assert asked[1:] == [["hysteresis", "coulomb_friction", "coulomb_friction"]]
 
 
+def test_another_under_which_the_motion_grows_without_bound_does_not(two, monkeypatch):
+    real = module._in_place
+    monkeypatch.setattr(module, "_in_place", lambda *x: real(*x)._replace(before=refit(-np.inf)))
+    found, _ = two((-100.0, 0.0, -300.0))
+    assert [x.kind for x in found.selected] == ["cubic_stiffness", "hysteresis"]
+    assert found.look is LOOKED
+
+
 def test_an_effect_that_a_later_one_makes_needless_is_left_out(two):
     found, _ = two((0.0, 0.0, -WORTH * TEMPERATURE * 0.9))
     assert [x.kind for x in found.selected] == ["hysteresis"]

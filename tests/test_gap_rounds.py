@@ -333,6 +333,20 @@ def test_the_round_stays_where_the_law_explains_no_more_elsewhere(moved):
     assert moved({}, HYSTERESIS[:1])[2] == first  # nowhere else to go
 
 
+@pytest.mark.parametrize("last", [0.0, -np.inf])
+def test_a_law_elsewhere_is_taken_unless_the_motion_grows_without_bound(monkeypatch, last):
+    once, anew, look = ranking(0.0), ranking(1.0), SimpleNamespace(clear=True)
+    origin = _Found(BENCH, "begun", (), (), None)
+    at = origin._replace(look=look, rounds=(once,), selected=once.ranked[:1], before=refit(0.0))
+    monkeypatch.setattr(causes, "elsewhere", lambda *_: anew)
+    monkeypatch.setattr(causes, "looked", lambda *_: look)
+    monkeypatch.setattr(
+        _Found, "taken", lambda self, of: self._replace(rounds=(of,), selected=of.ranked, before=refit(last))
+    )
+    found = causes._elsewhere(at, origin, (), BENCH.model, (), silent)
+    assert found.rounds[0] is (anew if last == 0.0 else once)
+
+
 # what is left is no noise
 
 
