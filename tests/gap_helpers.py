@@ -68,4 +68,8 @@ def record(u, y, kinds=SENSED, name="record"):
     return Record(u[:, None], y, DT, inputs=("drive",), outputs=outputs, name=name)
 
 
+def silent(text: str) -> None:
+    """Says nothing."""
+
+
 JOINT, WALL = (0, 1), (GROUND, 0)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gap_helpers import SAMPLES, chain, drive, exact, noisy, record
+from gap_helpers import SAMPLES, chain, drive, exact, noisy, record, silent
 
 from jaxsid import diagnose
 from jaxsid.gap import causes as module
@@ -246,7 +246,7 @@ def test_where_numbers_alone_are_in_doubt_the_one_that_explains_most_is_named(mo
     monkeypatch.setattr(module, "rank", lambda *_: little)
     monkeypatch.setattr(_Found, "taken", lambda at, found: at._replace(selected=found.ranked[:1]))
     at = _Found(BENCH, SimpleNamespace(scored=scored), (), (), refit(0.0))
-    assert len(_numbers(at, (), chain(), (), lambda text: None).selected) == named
+    assert len(_numbers(at, (), chain(), (), silent).selected) == named
 
 
 def test_beside_a_law_numbers_are_ranked_only_where_a_quick_fit_of_one_hints_at_it(monkeypatch):
@@ -260,10 +260,10 @@ def test_beside_a_law_numbers_are_ranked_only_where_a_quick_fit_of_one_hints_at_
         module, "rank", lambda bench, found, *_: ranked_ones.append(found) or ranking(-1.0, without=-1.0)
     )
     at = _Found(BENCH, SimpleNamespace(scored="places"), (), (), refit(0.0))
-    assert _numbers(at, (), chain(), (), lambda text: None) is at
+    assert _numbers(at, (), chain(), (), silent) is at
     assert not ranked_ones
     hints["input_gain"] = 0.6 * TELLING
-    _numbers(at, (), chain(), (), lambda text: None)
+    _numbers(at, (), chain(), (), silent)
     assert ranked_ones == [off]
 
 
@@ -284,7 +284,7 @@ def test_a_number_under_which_the_motion_grows_without_bound_is_refused(monkeypa
             return at._replace(selected=(*at.selected, of.ranked[0]), before=refit(evidence))
 
         monkeypatch.setattr(_Found, "taken", taken)
-        found = _numbers(at, (), chain(), (), lambda text: None)
+        found = _numbers(at, (), chain(), (), silent)
         assert [x.kind for x in found.selected] == named
         assert found.holds
 
@@ -335,7 +335,7 @@ def two(monkeypatch):
         monkeypatch.setattr(module, "refitted", fitted)
         monkeypatch.setattr(module, "rank_again", rank_again)
         whole = at.before._replace(deviations=({"size": deviation}, {"size": 0.1}))
-        found = _reconsidered(at._replace(before=whole), chain(), (), lambda text: None)
+        found = _reconsidered(at._replace(before=whole), chain(), (), silent)
         # what was next to it, and what comes first beside the other
         assert asked[0] == ["cubic_stiffness", "backlash", "coulomb_friction"]
         return found, asked

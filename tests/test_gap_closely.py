@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from gap_helpers import DT, JOINT, chain, drive, noisy, record, with_effect
+from gap_helpers import DT, JOINT, chain, drive, noisy, record, silent, with_effect
 from scipy.linalg import expm
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
@@ -153,7 +153,6 @@ def followed(monkeypatch, rounds, parts, place=B12):
     monkeypatch.setattr(causes, "_further", further)
     monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
-    silent = lambda text: None  # noqa: E731
     return origin, ends, begun, _followed(origin, candidates, BENCH.model, (), silent)
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effects_truth import GROUND
-from gap_helpers import chain, drive, noisy, record, with_effect
+from gap_helpers import chain, drive, noisy, record, silent, with_effect
 from test_gap_causes import B12, B23, BENCH, candidate, refit
 
 from jaxsid.gap import nested as module
@@ -19,10 +19,6 @@ from jaxsid.mechanics.lumped import Effect
 
 FRICTION, FORCE, STEPS = {"between": ("ground", "b2")}, 0.8, 30
 STATES = (np.zeros((1, 6)),)  # of the best one
-
-
-def silent(text: str) -> None:
-    """Says nothing."""
 
 
 def round_of(*laws, errors=MappingProxyType({})):
