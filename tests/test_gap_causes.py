@@ -9,8 +9,8 @@ import pytest
 from gap_helpers import SAMPLES, chain, drive, exact, noisy, record, silent
 
 from jaxsid import diagnose
-from jaxsid.gap import causes as module
-from jaxsid.gap.causes import LEAST, TELLING, _beyond, _Found, _numbers, _reconsidered
+from jaxsid.gap import search as module
+from jaxsid.gap.causes import _beyond
 from jaxsid.gap.explain import (
     TEMPERATURE,
     _distinct,
@@ -25,6 +25,7 @@ from jaxsid.gap.numbers_off import OFF, numbers_off
 from jaxsid.gap.ranking import ERRORS, WORTH, Explanation, Ranking, alike, key_of, numbers_of, ranked, worth
 from jaxsid.gap.refit import Bench, Hypothesis, Refit
 from jaxsid.gap.screen import Candidate
+from jaxsid.gap.search import LEAST, TELLING, Found, _numbers, _reconsidered
 from jaxsid.mechanics.lumped import Connection, Effect, Input, Matrices, Sensor, lumped_model, second_order
 from jaxsid.physical.elements import element_matrices
 
@@ -203,7 +204,7 @@ def test_a_further_effect_must_be_worth_it():
 def test_a_refused_effect_leaves_what_was_found_as_it_is():
     first, second = ranking(0.0), ranking(1.0)
     other = second._replace(bench=BENCH._replace(substeps=7))
-    begun = _Found(BENCH, None, (), (), None)
+    begun = Found(BENCH, None, (), (), None)
     assert begun.refused(other) == begun._replace(bench=other.bench, rounds=(other,))
     found = begun._replace(rounds=(first,), selected=first.ranked[:1])
     assert found.refused(other) is found
@@ -244,8 +245,8 @@ def test_where_numbers_alone_are_in_doubt_the_one_that_explains_most_is_named(mo
     monkeypatch.setattr(module, "numbers_off", lambda *_: offs.pop(0))
     monkeypatch.setattr(module, "hint", lambda *_: TELLING)
     monkeypatch.setattr(module, "rank", lambda *_: little)
-    monkeypatch.setattr(_Found, "taken", lambda at, found: at._replace(selected=found.ranked[:1]))
-    at = _Found(BENCH, SimpleNamespace(scored=scored), (), (), refit(0.0))
+    monkeypatch.setattr(Found, "taken", lambda at, found: at._replace(selected=found.ranked[:1]))
+    at = Found(BENCH, SimpleNamespace(scored=scored), (), (), refit(0.0))
     assert len(_numbers(at, (), chain(), (), silent).selected) == named
 
 
@@ -259,7 +260,7 @@ def test_beside_a_law_numbers_are_ranked_only_where_a_quick_fit_of_one_hints_at_
     monkeypatch.setattr(
         module, "rank", lambda bench, found, *_: ranked_ones.append(found) or ranking(-1.0, without=-1.0)
     )
-    at = _Found(BENCH, SimpleNamespace(scored="places"), (), (), refit(0.0))
+    at = Found(BENCH, SimpleNamespace(scored="places"), (), (), refit(0.0))
     assert _numbers(at, (), chain(), (), silent) is at
     assert not ranked_ones
     hints["input_gain"] = 0.6 * TELLING
@@ -277,13 +278,13 @@ def test_a_number_under_which_the_motion_grows_without_bound_is_refused(monkeypa
     monkeypatch.setattr(module, "_reconsidered", lambda at, *_: at)
     monkeypatch.setattr(module, "looked", lambda *_: LOOKED)
     first = ranking(-5.0).ranked[:1]
-    at = _Found(BENCH, SimpleNamespace(scored="places"), (ranking(-5.0),), first, refit(-5.0))
+    at = Found(BENCH, SimpleNamespace(scored="places"), (ranking(-5.0),), first, refit(-5.0))
     for evidence, named in ((0.0, ["cubic_stiffness", "stiffness_error"]), (-np.inf, ["cubic_stiffness"])):
 
         def taken(at, of, evidence=evidence):
             return at._replace(selected=(*at.selected, of.ranked[0]), before=refit(evidence))
 
-        monkeypatch.setattr(_Found, "taken", taken)
+        monkeypatch.setattr(Found, "taken", taken)
         found = _numbers(at, (), chain(), (), silent)
         assert [x.kind for x in found.selected] == named
         assert found.holds
@@ -305,7 +306,7 @@ def two(monkeypatch):
     cubic, later = ("cubic_stiffness", B12), ("hysteresis", B23)
     selected = explained(*cubic, -500.0, [cubic]), explained(*later, 0.0, [cubic, later])
     rounds = ranking(-500.0, -600.0), ranking(0.0, kinds=[later])
-    at = _Found(BENCH, LOOKED, rounds, selected, selected[-1].refit)
+    at = Found(BENCH, LOOKED, rounds, selected, selected[-1].refit)
     monkeypatch.setattr(module, "states_without", lambda found, row: ())
     monkeypatch.setattr(module, "changes_of", lambda found, bench: None)
     monkeypatch.setattr(module, "looked", lambda *_: AGAIN)

@@ -9,13 +9,23 @@ from gap_helpers import DT, JOINT, chain, drive, noisy, record, silent, with_eff
 from scipy.linalg import expm
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
-from jaxsid.gap import causes
-from jaxsid.gap.causes import _followed, _Found
-from jaxsid.gap.closely import LENGTH, PARTED, closely, implied, motions_to_begin, parting, tightened
+from jaxsid.gap import search
+from jaxsid.gap.closely import (
+    LENGTH,
+    PARTED,
+    begun_along,
+    closely,
+    implied,
+    motions_to_begin,
+    parting,
+    tightened,
+)
 from jaxsid.gap.closure import left_of
 from jaxsid.gap.examine import examine
+from jaxsid.gap.explain import TEMPERATURE
 from jaxsid.gap.look import Look
 from jaxsid.gap.places import Place
+from jaxsid.gap.ranking import LOUD, WORTH
 from jaxsid.gap.refit import (
     Hypothesis,
     as_guessed,
@@ -24,6 +34,7 @@ from jaxsid.gap.refit import (
     tied,
     weighed_anew,
 )
+from jaxsid.gap.search import Found, _followed
 from jaxsid.gap.windows import SHORTEST
 from jaxsid.mechanics.lumped import Effect, second_order
 
@@ -130,58 +141,100 @@ def test_held_out_samples_are_followed_as_closely(snaps, fitted):
     assert (left["linear"] > 5 * left["law"]).all()
 
 
-def followed(monkeypatch, rounds, parts, place=B12):
-    """What comes of rounds, each so many laws taken and so much left by the best one, and what they began with."""
+def test_usual_windows_begin_on_the_motion_that_short_ones_follow(snaps, fitted):
+    _, _, usual, bench = snaps
+    rates = 2 * np.pi / (DT * np.array([80.0, 60.0, 40.0]))
+
+    def motion(first):
+        phase = np.multiply.outer(DT * np.asarray(first), rates)
+        return np.concatenate([np.sin(phase), rates * np.cos(phase)], axis=1)
+
+    own = np.ones((len(bench.blocks[0].first), 2))
+    states = tuple(np.concatenate([motion(b.first), own], axis=1) for b in bench.blocks)
+    begun = begun_along(usual, bench, fitted._replace(fit=fitted.fit._replace(states=states)))
+    unit = np.concatenate([np.ones(3), rates])
+    for block, found in zip(begun.blocks, begun.states, strict=True):
+        first = np.asarray(block.first)
+        there = (first >= 0) & (first < SEEN)
+        assert there.any()
+        np.testing.assert_allclose(found[there] / unit, motion(first[there]) / unit, atol=5e-3)
+        np.testing.assert_array_equal(found[first < 0], 0.0)
+
+
+def followed(monkeypatch, rounds, parts, place=B12, tried=()):
+    """What comes of rounds, each of so many laws taken, so much left by the best one, and its evidence."""
     look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
-    origin = _Found(BENCH, look, (), (), None)
+    origin = Found(BENCH, look, (), (), None)
     law = ranking(0.0, kinds=[("cogging_ripple", B12)])
     ends, begun = [], []
-    for selected, left in rounds:
-        last = law._replace(ranked=(law.ranked[0]._replace(left=left),))
+    for selected, left, evidence in rounds:
+        last = law._replace(ranked=(law.ranked[0]._replace(left=left, evidence=evidence),))
         ends.append(origin._replace(rounds=(last,), selected=last.ranked[:selected], before=refit(0.0)))
 
     def further(begin, here, *_):
         begun.append((begin, tuple(here)))
         return ends[len(begun) - 1]
 
-    monkeypatch.setattr(causes, "at_likeliest", lambda look, candidates: tuple(candidates))
-    monkeypatch.setattr(causes, "likeliest", lambda scored: Place(*next(iter(place.items()))))
-    monkeypatch.setattr(causes, "closely", lambda *_: BENCH._replace(loose=0.1))
-    monkeypatch.setattr(causes, "begun_near", lambda bench, scored: bench._replace(jump=0.2))
-    monkeypatch.setattr(causes, "again", lambda law, refit: candidate("cogging_ripple", B23))
-    monkeypatch.setattr(causes, "changes_of", lambda found, bench: np.arange(9.0))
-    monkeypatch.setattr(causes, "_further", further)
-    monkeypatch.setattr(causes, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
+    monkeypatch.setattr(search, "at_likeliest", lambda look, candidates: tuple(candidates))
+    monkeypatch.setattr(search, "likeliest", lambda scored: Place(*next(iter(place.items()))))
+    monkeypatch.setattr(search, "closely", lambda *_: BENCH._replace(loose=0.1))
+    monkeypatch.setattr(search, "begun_along", lambda bench, of, found: bench._replace(jump=0.2))
+    monkeypatch.setattr(search, "again", lambda law, refit: candidate("cogging_ripple", B23))
+    monkeypatch.setattr(search, "changes_of", lambda found, bench: np.arange(9.0))
+    monkeypatch.setattr(search, "_further", further)
+    monkeypatch.setattr(search, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
-    return origin, ends, begun, _followed(origin, candidates, BENCH.model, (), silent)
+    best = ranking(0.0, kinds=[("end_stop", B12)])
+    before = origin._replace(rounds=(best,), selected=tried)
+    return origin, ends, begun, _followed(before, origin, candidates, BENCH.model, (), silent)
 
 
-@pytest.mark.parametrize(
-    ("selected", "left", "taken"),
-    [
-        (1, 1.5, True),
-        (1, 2.5, False),  # too much is left
-        (0, 1.5, False),  # nothing is worth it
-    ],
-)
+FAR = 2 * WORTH * TEMPERATURE
+
+
+@pytest.mark.parametrize(("selected", "left", "taken"), [(1, 1.5, True), (0, 1.5, False)])
 def test_it_is_taken_where_neighbours_part(monkeypatch, selected, left, taken):
-    origin, ends, begun, found = followed(monkeypatch, [(selected, left)], True)
+    origin, ends, begun, found = followed(monkeypatch, [(selected, left, 0.0)], True)
     (begin, here) = begun[0]
     assert len(begun) == 1
-    assert len(here) == causes.CLOSELY
+    assert len(here) == search.CLOSELY
     assert begin == origin._replace(bench=BENCH._replace(loose=0.1))
     assert found == ((ends[0], begin) if taken else None)
 
 
-@pytest.mark.parametrize(("selected", "left", "taken"), [(1, 1.5, True), (1, 2.5, False), (0, 1.5, False)])
-def test_where_they_hardly_part_its_law_is_tried_in_usual_windows(monkeypatch, selected, left, taken):
-    origin, ends, begun, found = followed(monkeypatch, [(1, 1.5), (selected, left)], False)
+@pytest.mark.parametrize(
+    ("first", "second", "taken"),
+    [
+        ((1, 1.5), (1, 1.5, 0.0), 1),
+        ((1, 1.5), (1, 2.5, 0.0), None),  # too much is left
+        (
+            (1, 1.5),
+            (1, 2.5, FAR),
+            1,
+        ),  # but far less than by what was tried before: another effect is still to be found
+        ((1, 2.5), (1, 2.5, FAR), 1),
+        ((1, 2.5), (1, 2.5, 0.0), None),
+        ((1, 1.5), (0, 1.5, 0.0), None),  # nothing is worth it
+        ((1, 1.5), (0, 2.5, -math.inf), 0),  # no motion under that law follows the records for so long
+        ((1, 2.5), (0, 2.5, -math.inf), None),
+    ],
+)
+def test_where_they_hardly_part_its_law_is_tried_in_usual_windows(monkeypatch, first, second, taken):
+    # nor is what leaves much in windows of a few samples taken as it is
+    origin, ends, begun, found = followed(monkeypatch, [(*first, 0.0), second], first[1] > LOUD)
     begin, tried = begun[1]
     assert begin == origin._replace(bench=BENCH._replace(jump=0.2))
     assert tried[0].place == B23
     np.testing.assert_array_equal(tried[0].changes, np.arange(9.0))
     assert len(tried) == 10
-    assert found == ((ends[1], begin) if taken else None)
+    assert found == (None if taken is None else (ends[taken], begun[taken][0]))
+
+
+def test_a_law_that_was_taken_before_and_leaves_as_much_is_not_tried_again(monkeypatch):
+    same = ranking(0.0, kinds=[("cogging_ripple", B12)]).ranked
+    _, _, begun, found = followed(monkeypatch, [(1, 2.5, 0.0), (1, 2.5, FAR)], False, tried=same)
+    assert found is None
+    assert len(begun) == 1
 
 
 def test_what_acts_between_no_bodies_is_not_followed(monkeypatch):

@@ -1,15 +1,19 @@
 """Numbers that a fit holds for off: what one quick fit says of them, against a nominal model that is wrong in one."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from gap_bench import bench, colored
-from gap_helpers import chain, drive, exact
+from gap_helpers import chain, drive, exact, silent
 
-from jaxsid.gap.causes import TELLING
+from jaxsid.gap import search
 from jaxsid.gap.explain import NUMBERS
 from jaxsid.gap.numbers_off import hint, numbers_off
 from jaxsid.gap.refit import Hypothesis, refitted
+from jaxsid.gap.search import TELLING
 
 
 def test_a_quick_fit_hints_at_the_number_that_is_off_and_at_no_other():
@@ -28,3 +32,42 @@ def test_a_quick_fit_hints_at_the_number_that_is_off_and_at_no_other():
 def test_nothing_is_off_in_a_good_model():
     of = bench(*colored(exact(drive()), 4))
     assert numbers_off(of, refitted(of, Hypothesis())) == ()
+
+
+@pytest.mark.parametrize("selected", [(), ("law",)])
+@pytest.mark.parametrize("small", [True, False])
+@pytest.mark.parametrize("off", [(), ("number",)])
+@pytest.mark.parametrize("finding", ["structure", "parameters"])
+def test_numbers_are_asked_for_where_what_no_law_explains_is_slight(
+    monkeypatch, finding, off, small, selected
+):
+    """A number far off may come with noise whose colour tests take for a little structure."""
+    bench = SimpleNamespace(name="bench")
+    asked = []
+
+    def numbers(at, lacking, *_):
+        asked.append((at.before, at.look.scored, lacking))
+        return at._replace(selected=(*at.selected, *off))
+
+    monkeypatch.setattr(search, "bench_of", lambda *_: bench)
+    monkeypatch.setattr(search, "_effects", lambda at, *_: at._replace(selected=selected, before="laws"))
+    monkeypatch.setattr(search, "slight", lambda found: small)
+    monkeypatch.setattr(search, "refitted", lambda of, hypothesis, changes: (hypothesis, changes))
+    monkeypatch.setattr(search, "changes_found", lambda found: "changes")
+    monkeypatch.setattr(search, "attached_candidates", lambda look: ["spring"] * 9)
+    monkeypatch.setattr(search, "_numbers", numbers)
+    examined = SimpleNamespace(noises=(), fit="fit", null="null", scored="places", finding=finding)
+    found = search.searched(chain(), (), examined, silent)
+    alone = ((Hypothesis(), "changes"), None, ["spring"] * search.LACKING)
+    beside = ("laws", "places", ())
+    if finding == "parameters":
+        assert asked == [alone]
+        assert found.selected == off
+    elif selected or not small:
+        assert asked == [beside]
+        assert found.selected == (*selected, *off)
+    else:
+        assert asked == [alone]
+        # where no number is off all stays as the laws left it
+        assert found.selected == off
+        assert found.before == (alone[0] if off else "laws")

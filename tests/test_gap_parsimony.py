@@ -7,9 +7,8 @@ import pytest
 from gap_helpers import silent
 from test_gap_causes import B12, B23, BENCH, candidate, refit
 
-from jaxsid.gap import causes, explain
+from jaxsid.gap import explain, search
 from jaxsid.gap import ranking as ranking_of
-from jaxsid.gap.causes import _Found
 from jaxsid.gap.explain import TEMPERATURE
 from jaxsid.gap.ranking import (
     LOUD,
@@ -21,6 +20,7 @@ from jaxsid.gap.ranking import (
     parsimonious,
     ranked,
 )
+from jaxsid.gap.search import Found
 
 
 def misfit(*laws, without=100.0):
@@ -134,14 +134,14 @@ def taken(monkeypatch):
             last = refit(-np.inf) if best.kind in diverging else best.refit
             return self._replace(rounds=(of,), selected=(*self.selected, best), before=last)
 
-        monkeypatch.setattr(_Found, "taken", take)
-        monkeypatch.setattr(causes, "looked", lambda *_: look)
-        monkeypatch.setattr(causes, "rank", lambda *_: first)
-        monkeypatch.setattr(causes, "worth", lambda of, least: True)
-        monkeypatch.setattr(causes, "_least", lambda look: 0.0)
-        monkeypatch.setattr(causes, "plainer", lambda *_: plain)
-        at = _Found(BENCH, look, (), selected, refit(0.0) if selected else None)
-        return at, causes._further(at, (), explain.FIRST, BENCH.model, (), silent)
+        monkeypatch.setattr(Found, "taken", take)
+        monkeypatch.setattr(search, "looked", lambda *_: look)
+        monkeypatch.setattr(search, "rank", lambda *_: first)
+        monkeypatch.setattr(search, "worth", lambda of, least: True)
+        monkeypatch.setattr(search, "_least", lambda look: 0.0)
+        monkeypatch.setattr(search, "plainer", lambda *_: plain)
+        at = Found(BENCH, look, (), selected, refit(0.0) if selected else None)
+        return at, search._further(at, (), explain.FIRST, BENCH.model, (), silent)
 
     return run
 

@@ -360,6 +360,14 @@ def test_a_start_that_diverges_has_no_evidence(cubic):
     assert found.fit.steps == 1
 
 
+def test_a_law_that_lets_the_motion_grow_begins_nearer_to_none(monkeypatch, cubic):
+    off = Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=-1e7),))
+    found = refitted(cubic, off, steps=60)
+    assert abs(pull(found, "coefficient", 1e6)) < 3
+    monkeypatch.setattr("jaxsid.gap.fit.HALVINGS", 0)
+    assert refitted(cubic, off).fit.evidence == -np.inf
+
+
 def test_states_make_room_for_effects():
     plain, own = np.arange(12.0).reshape(2, 6), np.array([[1.0, 2.0], [3.0, 4.0]])
     grown = _with_own(np.hstack([plain, own]), 6, 3)
@@ -449,7 +457,7 @@ def test_two_effects_at_once(cubic):
         (effect("cubic_stiffness", ("b1", "b2"), coefficient=5e5), effect("sensor_gain", "s2", factor=1.0))
     )
     level = PART * y.std(axis=0)
-    found = refitted(bench(y, level), hypothesis)
+    found = refitted(bench(y, level), hypothesis, steps=60)
     assert abs(pull(found, "coefficient", 1e6)) < 3
     assert abs(pull(found, "factor", 1.1, row=1)) < 3
     assert found.fit.squares / found.fit.equations == pytest.approx(1, abs=0.08)

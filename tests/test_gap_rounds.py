@@ -9,10 +9,9 @@ import pytest
 from gap_helpers import chain, silent
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
-from jaxsid.gap import causes, explain
+from jaxsid.gap import explain, search
 from jaxsid.gap import look as look_of
 from jaxsid.gap import ranking as ranking_of
-from jaxsid.gap.causes import _Found, _otherwise
 from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
 from jaxsid.gap.look import Look
 from jaxsid.gap.places import Place
@@ -23,6 +22,7 @@ from jaxsid.gap.ranking import (
     ranked,
 )
 from jaxsid.gap.refit import Hypothesis
+from jaxsid.gap.search import Found, _otherwise
 
 B13 = {"between": ("b1", "b3")}
 LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping"]
@@ -229,7 +229,7 @@ def searched(monkeypatch):
         bench = BENCH if whole else BENCH._replace(blocks=(SimpleNamespace(),))
         first = first._replace(bench=bench)
         look = SimpleNamespace(clear=clear)
-        origin = _Found(bench, "begun", (), (), None)
+        origin = Found(bench, "begun", (), (), None)
         at = origin._replace(look=look, rounds=(first,), selected=first.ranked[:1], before=refit(0.0))
 
         def taken(self, of):
@@ -242,10 +242,10 @@ def searched(monkeypatch):
                 rounds=(*other.rounds, *more), selected=(*other.selected, *(m.ranked[0] for m in more))
             )
 
-        monkeypatch.setattr(_Found, "taken", taken)
-        monkeypatch.setattr(causes, "looked", lambda *_: look)
-        monkeypatch.setattr(causes, "to_try", lambda look, first: ())
-        monkeypatch.setattr(causes, "_further", further)
+        monkeypatch.setattr(Found, "taken", taken)
+        monkeypatch.setattr(search, "looked", lambda *_: look)
+        monkeypatch.setattr(search, "to_try", lambda look, first: ())
+        monkeypatch.setattr(search, "_further", further)
         return at, _otherwise(at, origin, (), BENCH.model, (), silent)
 
     return run
@@ -326,12 +326,12 @@ def test_the_round_stays_where_the_law_explains_no_more_elsewhere(moved):
 @pytest.mark.parametrize("last", [0.0, -np.inf])
 def test_a_law_elsewhere_is_taken_unless_the_motion_grows_without_bound(monkeypatch, last):
     once, anew, look = ranking(0.0), ranking(1.0), SimpleNamespace(clear=True)
-    origin = _Found(BENCH, "begun", (), (), None)
+    origin = Found(BENCH, "begun", (), (), None)
     at = origin._replace(look=look, rounds=(once,), selected=once.ranked[:1], before=refit(0.0))
-    monkeypatch.setattr(causes, "elsewhere", lambda *_: anew)
-    monkeypatch.setattr(causes, "looked", lambda *_: look)
+    monkeypatch.setattr(search, "elsewhere", lambda *_: anew)
+    monkeypatch.setattr(search, "looked", lambda *_: look)
     monkeypatch.setattr(
-        _Found, "taken", lambda self, of: self._replace(rounds=(of,), selected=of.ranked, before=refit(last))
+        Found, "taken", lambda self, of: self._replace(rounds=(of,), selected=of.ranked, before=refit(last))
     )
-    found = causes._elsewhere(at, origin, (), BENCH.model, (), silent)
+    found = search._elsewhere(at, origin, (), BENCH.model, (), silent)
     assert found.rounds[0] is (anew if last == 0.0 else once)

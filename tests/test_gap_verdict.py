@@ -9,17 +9,18 @@ import pytest
 from test_gap_causes import B12, B23, ranking, refit
 
 from jaxsid.gap import null
-from jaxsid.gap.causes import SLIGHT, Causes
+from jaxsid.gap.causes import Causes
 from jaxsid.gap.closure import Closure, Left, fraction
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import TEMPERATURE
+from jaxsid.gap.look import SLIGHT
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
+from jaxsid.gap.ranking import LOUD
 from jaxsid.gap.recalibrate import Recalibrated
 from jaxsid.gap.verdict import (
     IMITATED,
     LAPSE,
-    LOUD,
     MISSED,
     REMAINDER,
     TWOFOLD,
@@ -77,7 +78,7 @@ def test_noise_that_was_guessed_is_a_bound_where_more_than_noise_is_left():
 
 def test_what_is_far_above_the_noise_is_never_none(monkeypatch):
     # causes that chose nothing, and tests whose share is small beside what is left
-    monkeypatch.setattr("jaxsid.gap.verdict.left_share", lambda fit: 0.1)
+    monkeypatch.setattr("jaxsid.gap.look.left_share", lambda fit: 0.1)
     fit = Recalibrated(None, *(np.zeros(1),) * 3, (), (), (), 0.0, 1000)
     tried = causes(ranking(0.0, -1.0), closures=[closure(0.29)])._replace(selected=())
     verdict = {}

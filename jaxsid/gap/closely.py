@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicHermiteSpline
 
 from jaxsid.gap.fit import links_of
 from jaxsid.gap.locate import Scored, likeliest, scored
@@ -111,6 +112,27 @@ def begun_near(bench: Bench, found: Scored) -> Bench:
         found: places, of the records.
     """
     return bench._replace(states=states_at(bench.blocks, implied(found)))
+
+
+def begun_along(bench: Bench, of: Bench, found: Refit) -> Bench:
+    """The bench with the motion to begin with that a fit in windows of a few samples follows.
+
+    Args:
+        bench: records in windows of any length.
+        of: the same records in those windows.
+        found: the fit.
+    """
+    size, motions = 2 * len(of.model.bodies), []
+    first = np.concatenate([np.asarray(b.first) for b in of.blocks])
+    record = np.concatenate([np.asarray(b.record) for b in of.blocks])
+    states = np.concatenate(found.fit.states)[:, :size]
+    for number, moved in enumerate(of.moved):
+        own = record == number
+        q, v = np.split(states[own], 2, axis=1)
+        path = CubicHermiteSpline(first[own] * moved.dt, q, v)
+        times = np.arange(len(moved.u)) * moved.dt
+        motions.append(np.concatenate([path(times), path(times, 1)], axis=1))
+    return bench._replace(states=states_at(bench.blocks, motions))
 
 
 def motions_to_begin(

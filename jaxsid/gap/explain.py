@@ -68,17 +68,21 @@ SPRING = "missing_connection"
 
 
 class Effort(NamedTuple):
-    """How many candidates are fitted roughly, how many thoroughly, in how many steps at most; the temperature."""
+    """How many candidates are fitted roughly, how many thoroughly, in how many steps at most, at which temperature.
+
+    None thoroughly that is so far behind.
+    """
 
     tried: int
     refined: int
     steps: int
     temperature: float
+    behind: float = CLOSE
 
 
 # with two effects a step costs several times as much
 FIRST, FURTHER = Effort(14, 4, 25, TEMPERATURE), Effort(16, 3, 16, TEMPERATURE)
-NUMBERS = Effort(12, 6, 25, MILD)
+NUMBERS = Effort(12, 6, 25, MILD, math.inf)  # in noise guessed too low what colours it may be far ahead
 
 
 def element_place(model: LumpedModel, element: Element) -> dict[str, Any]:
@@ -316,7 +320,7 @@ def _round(
         changes = changes_of(r, bench) if known is None else known.begin
         return _whole(bench, r.hypothesis, {"changes": changes}, effort)
 
-    close = [(top - value(r, bench)) / scale / effort.temperature < CLOSE for _, r in rough]
+    close = [(top - value(r, bench)) / scale / effort.temperature < effort.behind for _, r in rough]
     most = effort.refined + len(done)
     best = range(min(most, len(rough)))
     due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]

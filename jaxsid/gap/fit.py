@@ -22,6 +22,10 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e8
 EASED = 1e3  # factor by which damping falls where it held a step back
 IDLE = 2  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
+NONE = slice(0, 0)
+HALVINGS = (
+    5  # of how far a law is from what is likely beforehand, to begin with where it lets the motion grow
+)
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 
 
@@ -78,6 +82,7 @@ def fitted(
     substeps: int,
     steps: int = STEPS,
     gain: float = GAIN,
+    eased: slice = NONE,
 ) -> Fit:
     """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated.
 
@@ -90,10 +95,17 @@ def fitted(
         substeps: steps for each sampling interval.
         steps: most evaluations.
         gain: of the cost, in mean squares of what is left, that is not worth a step.
+        eased: unknowns that begin nearer to their prior's mean where the motion grows without bound.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
     at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
     damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
+    for _ in range(HALVINGS):
+        if np.isfinite(at.cost) or not np.any(theta[eased]):
+            break
+        theta = theta.copy()
+        theta[eased] = np.maximum((theta[eased] + prior.mean[eased]) / 2, prior.least[eased])
+        at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
     while done < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, links, damping)
         new = np.maximum(at.theta + move, prior.least)

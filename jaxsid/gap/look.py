@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsid.gap.deflate import deflated
-from jaxsid.gap.examine import NEGLIGIBLE
+from jaxsid.gap.examine import NEGLIGIBLE, Examination
 from jaxsid.gap.locate import Scored, likeliest, scored
-from jaxsid.gap.null import SIGNIFICANT, Null, null_test
+from jaxsid.gap.null import SIGNIFICANT, Null, left_share, null_test
 from jaxsid.gap.places import places_of
-from jaxsid.gap.ranking import ends_of
+from jaxsid.gap.ranking import LOUD, ends_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import Bench, Refit
 from jaxsid.gap.screen import Candidate, screen
@@ -22,6 +22,7 @@ from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import element_matrices, with_values
 from jaxsid.records import Record
 
+SLIGHT = 0.3  # of what is left: a part that tests find but that is of no matter
 PLACES = 4  # of one kind that are tried before other kinds, where something was found already
 
 
@@ -41,6 +42,18 @@ class Look(NamedTuple):
     @property
     def clear(self) -> bool:
         return bool(self.null.p_value >= SIGNIFICANT or self.null.share <= NEGLIGIBLE)
+
+
+def slight(found: Examination) -> bool:
+    """Whether what tests find is small beside the noise, so that no law could be told from it.
+
+    Noise is what is left where it is not loud, or each sensor's own and steady, however low its level was guessed.
+
+    Args:
+        found: where the structure is in doubt.
+    """
+    noisy = found.fit.squares < LOUD**2 * found.fit.equations or found.null.own
+    return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
 def candidates_of(look: Look) -> tuple[Candidate, ...]:

@@ -96,6 +96,19 @@ def alike(x: Explanation, y: Explanation, of: Ranking) -> bool:
     return bool(abs(x.evidence - y.evidence) / of.scale / of.temperature < SAME)
 
 
+def clearly(of: Ranking, other: Ranking) -> bool:
+    """Whether the best one of a round explains more than the best one of another, each in noise of its own.
+
+    Args:
+        of: the round.
+        other: of the same records, in windows as long.
+    """
+    if not other.ranked or not math.isfinite(other.ranked[0].evidence):
+        return True
+    mine, its = (r.ranked[0].evidence + volume(r.bench) for r in (of, other))
+    return bool((mine - its) / of.scale / of.temperature > WORTH)
+
+
 def key_of(kind: str, place: Mapping[str, Any]) -> Key:
     """Kind and place as one value to be compared; the order of two ends does not count."""
     ((where, ends),) = place.items()

@@ -412,7 +412,11 @@ def refitted(
     given = [_with_own(s, plain, slots.count) for s in (bench.states if states is None else states)]
     # all but laws and what comes late between two samples is integrated exactly
     exact = all(sort_of(CATALOGUE[e.kind]) == "linear" and e.kind != "input_delay" for e in effects)
-    search = {"substeps": 1 if exact else bench.substeps, "steps": steps, "gain": gain}
+    count = 1 if exact else bench.substeps
+    # what was there before holds; the last effect is what is new
+    end = len(start) + z.size
+    last = slice(end - z.shape[1], end)
+    search = {"substeps": count, "steps": steps, "gain": gain, "eased": last}
     fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, **search)
     return _concluded(bench, hypothesis, shot, fit)
 

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsid.gap.causes import SLIGHT, Causes
+from jaxsid.gap.causes import Causes
 from jaxsid.gap.closure import fraction, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
-from jaxsid.gap.null import left_share
-from jaxsid.gap.ranking import ERRORS, LOUD, Explanation, ends_of
+from jaxsid.gap.look import slight
+from jaxsid.gap.ranking import ERRORS, Explanation, ends_of
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 
 LIKELY = 0.9  # probability that the explanations named have together
@@ -73,7 +73,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     if causes is None:
         some = 0.5 * math.exp(-doubt / 0.05)
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
-    if found.finding == "structure" and not causes.selected and _slight(found):
+    if found.finding == "structure" and not causes.selected and slight(found):
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     pairs = _at_one_place(causes.selected)
@@ -87,15 +87,6 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         return Verdict("unknown", probability, likely, imitating)
     open_ones = any(len(x) > 1 for x in likely)
     return Verdict("ambiguous" if open_ones else "effect", probability, likely, paired=paired)
-
-
-def _slight(found: Examination) -> bool:
-    """Whether what tests find is small beside the noise, so that no law could be told from it.
-
-    Noise is what is left where it is not loud, or each sensor's own and steady, however low its level was guessed.
-    """
-    noisy = found.fit.squares < LOUD**2 * found.fit.equations or found.null.own
-    return bool(noisy and found.null.share < SLIGHT * left_share(found.fit))
 
 
 def _unexplained(causes: Causes, finding: str) -> float:
