@@ -161,11 +161,16 @@ def test_usual_windows_begin_on_the_motion_that_short_ones_follow(snaps, fitted)
         np.testing.assert_array_equal(found[first < 0], 0.0)
 
 
-def followed(monkeypatch, rounds, parts, place=B12, tried=()):
+def of_one(kind):
+    return refit(0.0, hypothesis=Hypothesis((Effect(kind, tuple(B12.items()), {}),)))
+
+
+def followed(monkeypatch, rounds, parts, place=B12, tried=(), kind="cogging_ripple"):
     """What comes of rounds, each of so many laws taken, so much left by the best one, and its evidence."""
     look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
     origin = Found(BENCH, look, (), (), None)
-    law = ranking(0.0, kinds=[("cogging_ripple", B12)])
+    law = ranking(0.0, kinds=[(kind, B12)])
+    law = law._replace(ranked=(law.ranked[0]._replace(refit=of_one(kind)),))
     ends, begun = [], []
     for selected, left, evidence in rounds:
         last = law._replace(ranked=(law.ranked[0]._replace(left=left, evidence=evidence),))
@@ -228,6 +233,13 @@ def test_where_they_hardly_part_its_law_is_tried_in_usual_windows(monkeypatch, f
     np.testing.assert_array_equal(tried[0].changes, np.arange(9.0))
     assert len(tried) == 10
     assert found == (None if taken is None else (ends[taken], begun[taken][0]))
+
+
+def test_neighbours_that_part_under_a_linear_law_tell_nothing_of_it(monkeypatch):
+    _, ends, begun, found = followed(
+        monkeypatch, [(1, 1.5, 0.0), (1, 1.5, 0.0)], True, kind="missing_connection"
+    )
+    assert found == (ends[1], begun[1][0])
 
 
 def test_a_law_that_was_taken_before_and_leaves_as_much_is_not_tried_again(monkeypatch):

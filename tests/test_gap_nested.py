@@ -37,8 +37,10 @@ def begun(monkeypatch):
     def run(first, evidences):
         fitted = []
 
-        def fit(bench, hypothesis, *, states, **_):
+        def fit(bench, hypothesis, *, states, steps, **_):
             assert states is STATES
+            if steps == 1:  # only how much it leaves there
+                return refit(0.0, hypothesis=hypothesis)
             fitted.append(hypothesis.effects[-1].kind)
             return refit(evidences[fitted[-1]], hypothesis=hypothesis)
 
@@ -125,3 +127,26 @@ def test_coulombs_law_gets_out_of_a_wrong_valley(rubbed):
     assert float(np.asarray(effect.parameters["force"])) == pytest.approx(FORCE, rel=0.02)
     # what Stribeck's law has beyond it tells nothing
     assert found.ranked[0].left == pytest.approx(found.ranked[1].left, rel=0.01)
+
+
+@pytest.mark.parametrize("right", [1.0, 0.25, 0.0625])
+def test_one_of_a_single_number_begins_with_the_part_of_it_that_leaves_least(monkeypatch, right):
+    """What another valley made of the number may be many times what this one needs."""
+    started = []
+
+    def fit(bench, hypothesis, *, steps, **_):
+        number = float(hypothesis.effects[-1].parameters["coefficient"])
+        if steps > 1:
+            started.append(number)
+        return refit(0.0, squares=abs(number - 8.0 * right), hypothesis=hypothesis)
+
+    first = round_of(("hysteresis", B12, 0.0, 1.0), ("cubic_stiffness", B12, -500.0, 1.3))
+    begin, cubic = first.ranked
+    of = Hypothesis((Effect("cubic_stiffness", tuple(B12.items()), {"coefficient": 8.0}),))
+    cubic = cubic._replace(refit=refit(-500.0, hypothesis=of))
+    monkeypatch.setattr(module, "refitted", fit)
+    monkeypatch.setattr(module, "states_without", lambda found, row: STATES)
+    monkeypatch.setattr(module, "changes_of", lambda found, bench: None)
+    monkeypatch.setattr(module, "value", lambda found, bench: -1e3)
+    nested(first._replace(ranked=(begin, cubic)), STEPS, silent)
+    assert started == [8.0 * right]

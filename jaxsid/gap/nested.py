@@ -7,6 +7,9 @@ that the best one holds as a special case lies in the same valley as it; from a 
 import math
 from collections.abc import Callable
 
+import numpy as np
+
+from jaxsid.gap.hypothesis import with_parameters
 from jaxsid.gap.ranking import (
     Explanation,
     Ranking,
@@ -18,11 +21,12 @@ from jaxsid.gap.ranking import (
     ranked,
     value,
 )
-from jaxsid.gap.refit import Refit, changes_of, refitted, states_without
+from jaxsid.gap.refit import Hypothesis, Refit, changes_of, refitted, states_without
 from jaxsid.parallel import side_by_side
 
 FEWER = 2  # that are tried
 NEAR = 4.0  # times what the best one leaves, from which on none is
+PARTS = 1.0, 0.5, 0.25, 0.125, 0.0625  # of its number that one begins with
 GAIN = 2.0  # of the search, below which it has come to an end
 
 
@@ -43,7 +47,10 @@ def nested(ranking: Ranking, steps: int, say: Callable[[str], None]) -> Ranking:
     def begun(y: Explanation) -> Refit:
         say(f"{y.kind} from where {best.kind} ends")
         start = {"changes": changes_of(best.refit, ranking.bench), "states": states_without(best.refit, row)}
-        return refitted(ranking.bench, y.refit.hypothesis, **start, steps=steps, gain=GAIN)
+        sizes = [refitted(ranking.bench, h, **start, steps=1) for h in _of_sizes(y)]
+        # what another valley made of its number may be far from what this one needs
+        first = min(sizes, key=lambda x: x.fit.squares).hypothesis
+        return refitted(ranking.bench, first, **start, steps=steps, gain=GAIN)
 
     new = dict(zip([y.key for y in due], side_by_side(begun, due), strict=True))
     better = {y.key for y in due if value(new[y.key], ranking.bench) > y.evidence}
@@ -58,6 +65,19 @@ def nested(ranking: Ranking, steps: int, say: Callable[[str], None]) -> Ranking:
         else:
             every.append((y, y.refit, y.evidence, y.left))
     return ranked(every, ranking.without, ranking.bench, ranking.temperature)
+
+
+def _of_sizes(y: Explanation) -> list[Hypothesis]:
+    """Its hypothesis, and with parts of its number where it has but one."""
+    of, row = y.refit.hypothesis, _row(y)
+    if row is None or numbers_of(y.kind) > 1:
+        return [of]
+    effect = of.effects[row]
+    parts = [{n: part * np.asarray(v) for n, v in effect.parameters.items()} for part in PARTS]
+    return [
+        of._replace(effects=(*of.effects[:row], with_parameters(effect, x), *of.effects[row + 1 :]))
+        for x in parts
+    ]
 
 
 def _row(x: Explanation) -> int | None:

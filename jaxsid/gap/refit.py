@@ -114,6 +114,11 @@ class Hypothesis(NamedTuple):
     effects: tuple[Effect, ...] = ()
     wrong: tuple[int, ...] = ()
 
+    @property
+    def linear(self) -> bool:
+        """Whether no effect is more than a change of the linear model or of what enters and leaves it."""
+        return all(sort_of(CATALOGUE[e.kind]) == "linear" for e in self.effects)
+
 
 class Refit(NamedTuple):
     """A fitted hypothesis.
@@ -411,7 +416,7 @@ def refitted(
     plain = 2 * len(bench.model.bodies)
     given = [_with_own(s, plain, slots.count) for s in (bench.states if states is None else states)]
     # all but laws and what comes late between two samples is integrated exactly
-    exact = all(sort_of(CATALOGUE[e.kind]) == "linear" and e.kind != "input_delay" for e in effects)
+    exact = hypothesis.linear and all(e.kind != "input_delay" for e in effects)
     count = 1 if exact else bench.substeps
     # what was there before holds; the last effect is what is new
     end = len(start) + z.size

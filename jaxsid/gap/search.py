@@ -191,7 +191,8 @@ def _followed(
     if not at.selected:
         return None
     law, told = at.selected[-1], not loud(at.rounds[-1])
-    if told and parting(at.bench, law.refit) > PARTED:
+    # neighbours part under laws that bend alone; short windows forgive a linear one what it lacks
+    if told and not law.refit.hypothesis.linear and parting(at.bench, law.refit) > PARTED:
         return at, begin
     if not told and law.key in {x.key for x in tried.selected}:
         return None
