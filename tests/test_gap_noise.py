@@ -109,8 +109,15 @@ def test_noise_that_was_guessed_is_no_louder_than_what_is_left_of_other_samples(
     found = no_louder(Noise(np.array([0.6, 0.6, np.nan]), taps, 0.0, "residual"), left)
     np.testing.assert_allclose(found.rms(), [0.3, 1.0, np.nan], rtol=1e-3)
     np.testing.assert_array_equal(found.taps, taps)
-    measured = Noise(np.array([0.6, 0.6, np.nan]), taps, 500.0, "periods")
-    np.testing.assert_array_equal(no_louder(measured, left).level, measured.level)
+
+
+@pytest.mark.parametrize(("part", "stands"), [(1.1, True), (0.8, True), (0.5, False)])
+def test_noise_that_was_measured_stands_unless_far_less_is_left_of_other_samples(part, stands):
+    """An impact may come a little later in the next period, as noise that it is not."""
+    measured = Noise(np.array([0.6, 0.6]), np.tile([1.0, -0.8], (2, 1)), 500.0, "periods")
+    found = no_louder(measured, np.column_stack([np.full(400, part), np.full(400, 9.0)]))
+    np.testing.assert_allclose(found.rms(), [1.0 if stands else part, 1.0], rtol=1e-3)
+    assert (found.degrees, found.source) == (measured.degrees, measured.source)
 
 
 def test_lines_have_the_deviation_that_is_said():

@@ -12,7 +12,7 @@ from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 from jaxsid.gap import explain, search
 from jaxsid.gap import look as look_of
 from jaxsid.gap import ranking as ranking_of
-from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _due, _roughly, extended
+from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _roughly, extended
 from jaxsid.gap.look import Look
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import (
@@ -20,6 +20,7 @@ from jaxsid.gap.ranking import (
     Whole,
     key_of,
     ranked,
+    still_due,
 )
 from jaxsid.gap.refit import Hypothesis
 from jaxsid.gap.search import Found, _otherwise
@@ -130,8 +131,17 @@ def test_springs_are_fitted_thoroughly_beside_a_law_that_is_not(best, values, du
     kinds = [("end_stop", B13), ("missing_connection", B13), ("missing_connection", B12)]
     rough = [(candidate(*k), refit(v)) for k, v in zip(kinds, values, strict=True)]
     done = {[k for k, _ in kinds].index(best): Whole(BENCH, refit(0.0))}
-    assert _due(rough, values, done, 40.0) == due
-    assert _due(rough, values, {}, 40.0) == [int(np.argmax(values))]
+    assert still_due(rough, values, done, 40.0) == due
+    assert still_due(rough, values, {}, 40.0) == [int(np.argmax(values))]
+
+
+@pytest.mark.parametrize(("body", "due"), [("b2", [1]), ("b3", [])])
+def test_a_periodic_force_is_fitted_thoroughly_in_the_place_of_a_part_that_swings(body, due):
+    kinds = [("missing_mode", {"body": "b2"}), ("periodic_disturbance", {"body": body})]
+    rough = [(candidate(*k), refit(v)) for k, v in zip(kinds, [0.0, -1e4], strict=True)]
+    assert still_due(rough, [0.0, -1e4], {0: Whole(BENCH, refit(0.0))}, 40.0) == due
+    # a periodic force stands for no part that swings
+    assert still_due(rough, [-1e4, 0.0], {1: Whole(BENCH, refit(0.0))}, 40.0) == []
 
 
 def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):

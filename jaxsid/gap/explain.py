@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from jaxsid.gap.nested import nested
 from jaxsid.gap.ranking import (
+    CLOSE,
     ERRORS,
-    STRAIGHT,
     Explanation,
     Key,
     Ranking,
@@ -31,6 +31,7 @@ from jaxsid.gap.ranking import (
     numbers_of,
     parsimonious,
     ranked,
+    still_due,
     straight,
     value,
     volume,
@@ -63,7 +64,6 @@ HOPELESS = 10.0  # times the squares that the best one leaves, from which on non
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 MORE = 3  # further ones that are fitted thoroughly as those before them turn out worse than they seemed
-CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 SPRING = "missing_connection"
 
 
@@ -326,30 +326,13 @@ def _round(
     due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]
     done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     near = CLOSE * scale * effort.temperature
-    while due := _due(rough, values := _values(rough, done, bench, part), done, near):
+    while due := still_due(rough, values := _values(rough, done, bench, part), done, near):
         top = max((values[i] for i in done), default=-math.inf)
         if sum(math.isfinite(values[i]) for i in done) >= most + MORE:
             values = [x if i in done else min(x, top - near) for i, x in enumerate(values)]
             break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     return nested(_compared(rough, values, done, bench, without, effort), effort.steps, say)
-
-
-def _due(
-    rough: Sequence[tuple[Candidate, Refit]], values: Sequence[float], done: Mapping[int, Whole], near: float
-) -> list[int]:
-    """What must still be fitted thoroughly: the best one, then springs and dampers where it acts, or nearly as good."""
-    if not rough or not math.isfinite(max(values)):
-        return []
-    best = int(np.argmax(values))
-    if best not in done:
-        return [best]
-    at, top = rough[best][0], values[best]
-    if straight(at.kind):
-        return []
-    plain = [(i, c) for i, (c, _) in enumerate(rough) if i not in done and straight(c.kind)]
-    reach = {i: near if ends_of(c.place) == ends_of(at.place) else STRAIGHT / CLOSE * near for i, c in plain}
-    return [i for i in reach if top - values[i] < reach[i]]
 
 
 def _roughly(

@@ -33,6 +33,7 @@ BANDS = 24  # of which the quietest is taken for noise
 STRETCHES = 8  # of time, in the quietest of which a band shows what is there throughout
 STEADY = 0.4  # part of what is left, in power: where less is there throughout, that alone is noise
 SHARED = 1.5  # lines that share what one shows, with a window of Hann
+REFUTED = 0.7  # of noise that periods or repeated records tell, less than which none of it can be left
 FINEST = 1e-7  # least noise next to a sensor's signal: that of numbers with seven digits
 SOURCES = ("periods", "repeated records", "quiet part", "residual")
 
@@ -333,18 +334,19 @@ def quieter(guess: Noise, left: Noise, found: float = 1.0) -> Noise:
 
 
 def no_louder(noise: Noise, left: Float[np.ndarray, "samples outputs"]) -> Noise:
-    """Each sensor's noise where all that tells of it is a guess: no more than a model leaves of other samples.
+    """Each sensor's noise, no more than a model leaves of other samples.
 
-    What disturbs the input, say, may be louder in one part of a record than in another.
+    What disturbs the input, say, may be louder in one part of a record than in another. Noise that is no guess stands
+    but where that is far less: motion under a law need not repeat when the input does.
 
     Args:
-        noise: of a record; it stands where it is no guess.
+        noise: of a record.
         left: of samples that the model was not fitted to; NaN where nothing was measured.
     """
     counts, squares = np.isfinite(left).sum(axis=0), np.nansum(left**2, axis=0)
     least = np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.inf)
     rms = noise.rms()
-    less = (noise.degrees <= 0) & (least < rms)
+    less = least < (1.0 if noise.degrees <= 0 else REFUTED) * rms
     level = np.where(less, noise.level * least / np.where(less, rms, 1.0), noise.level)
     return Noise(level, noise.taps, noise.degrees, noise.source)
 

@@ -15,12 +15,14 @@ WORTH = 6.0  # tempered gain of evidence from which on effects are taken
 LESS = 0.1  # part of what is left above the noise that an effect must remove
 SAME = 3.0  # tempered difference of evidence below which two are hardly told apart
 STRAIGHT = 3.0  # log odds of springs and dampers over laws that hardly differ from them as they are
+CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate is not fitted thoroughly
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
 TOLD = 3.0  # deviations from zero from which on a number is known; right ones of the second test set have 11
 # kinds that are a wrong number of the model
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
+RINGING = "periodic_disturbance"  # what a part that swings does if nothing damps it
 Key = tuple[str, str, tuple[str, ...]]
 
 
@@ -224,6 +226,36 @@ def straight(kind: str) -> bool:
         kind: its name.
     """
     return CATALOGUE[kind].changes is not None and bool(CATALOGUE[kind].needs)
+
+
+def still_due(
+    rough: Sequence[tuple[Candidate, Refit]], values: Sequence[float], done: Mapping[int, Whole], near: float
+) -> list[int]:
+    """What must still be fitted thoroughly: the best one, then what it may stand for.
+
+    Springs and dampers where it acts, or nearly as good; a periodic force in the place of a part that swings, whose
+    own motion, free in every window, is one.
+
+    Args:
+        rough: candidates, fitted to a part of the records.
+        values: evidence of each.
+        done: those that are fitted thoroughly.
+        near: difference of evidence beyond which springs and dampers are not.
+    """
+    if not rough or not math.isfinite(max(values)):
+        return []
+    best = int(np.argmax(values))
+    if best not in done:
+        return [best]
+    at, top = rough[best][0], values[best]
+    if straight(at.kind):
+        return []
+    left = [(i, c) for i, (c, _) in enumerate(rough) if i not in done]
+    here = {i for i, c in left if ends_of(c.place) == ends_of(at.place)}
+    swings = CATALOGUE[at.kind].vibrates is not None
+    due = [i for i, c in left if swings and i in here and c.kind == RINGING]
+    reach = {i: near if i in here else STRAIGHT / CLOSE * near for i, c in left if straight(c.kind)}
+    return due + [i for i in reach if top - values[i] < reach[i]]
 
 
 def numbers_of(kind: str) -> int:
