@@ -77,7 +77,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     pairs = _at_one_place(causes.selected)
-    imitating = _imitating(pairs)
+    imitating = _imitating(pairs, clear=causes.places is None)
     unexplained, twofold = _unexplained(causes, found.finding), IMITATED if imitating else TWOFOLD
     paired = pairs[0] if pairs and twofold > unexplained else ()
     unexplained = twofold if paired else unexplained
@@ -121,13 +121,17 @@ def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, 
     ]
 
 
-def _imitating(pairs: list[tuple[Explanation, Explanation]]) -> tuple[Explanation, ...]:
+def _imitating(pairs: list[tuple[Explanation, Explanation]], *, clear: bool) -> tuple[Explanation, ...]:
     """Two springs that are not straight: more often one curve of neither's shape than both at once.
+
+    A loop is no curve: with it, where nothing is left, both are there.
 
     Args:
         pairs: at one place each.
+        clear: whether tests find nothing in what is left.
     """
-    springs = (pair for pair in pairs if all(CATALOGUE[x.kind].restoring for x in pair))
+    of = lambda pair: [CATALOGUE[x.kind] for x in pair]  # noqa: E731
+    springs = (p for p in pairs if all(k.restoring and not (clear and k.states) for k in of(p)))
     return next(springs, ())
 
 
