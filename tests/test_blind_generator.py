@@ -20,7 +20,7 @@ import generate  # pyright: ignore[reportMissingImports]  # noqa: E402
 import laws  # pyright: ignore[reportMissingImports]  # noqa: E402
 import score  # pyright: ignore[reportMissingImports]  # noqa: E402
 import systems  # pyright: ignore[reportMissingImports]  # noqa: E402
-from plan import plan  # pyright: ignore[reportMissingImports]  # noqa: E402
+from plan import SETS, plan  # pyright: ignore[reportMissingImports]  # noqa: E402
 from truth import Loop, respond  # pyright: ignore[reportMissingImports]  # noqa: E402
 
 DT, NAMES = 0.01, ("b1", "b2", "b3")
@@ -287,7 +287,7 @@ def test_motion_ahead_of_the_record_is_the_same_motion():
     np.testing.assert_allclose(whole, later, atol=1e-9)
 
 
-@pytest.mark.parametrize("which", ["dev", "test", "second", "third", "fourth"])
+@pytest.mark.parametrize("which", SETS)
 def test_the_plan_holds_every_kind_often_enough(which):
     planned = plan(which, 240)
     counts = Counter(k for case in planned for k in case.kinds)
@@ -300,9 +300,7 @@ def test_the_plan_holds_every_kind_often_enough(which):
 
 def test_sets_have_nothing_in_common():
     assert plan("dev", 24) == plan("dev", 240)[:24]
-    each = [
-        tuple(x.kinds for x in plan(which, 240)) for which in ("dev", "test", "second", "third", "fourth")
-    ]
+    each = [tuple(x.kinds for x in plan(which, 240)) for which in SETS]
     assert len(set(each)) == len(each)
 
 

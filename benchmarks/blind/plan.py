@@ -15,6 +15,7 @@ SETS = {
     "second": 11_900_000,
     "third": 14_700_000,
     "fourth": 17_300_000,
+    "fifth": 19_900_000,
 }
 NOISES = ((0.01, 0.6), (0.001, 0.2), (0.05, 0.2))
 FAMILIES = {
@@ -23,6 +24,7 @@ FAMILIES = {
     "second": ("mass", "chain", "drive", "frame"),
     "third": ("mass", "chain", "drive", "frame"),
     "fourth": ("mass", "chain", "drive", "frame"),
+    "fifth": ("mass", "chain", "drive", "frame"),
 }
 # of a cycle's cases, by family in the order above: a mass says little about places
 TESTED = (0.15, 0.35, 0.2, 0.3)
@@ -32,6 +34,7 @@ SHARES = {
     "second": TESTED,
     "third": TESTED,
     "fourth": TESTED,
+    "fifth": TESTED,
 }
 ONE_SENSOR, COLOURED = 0.15, 0.2
 
