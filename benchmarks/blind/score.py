@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+from coverage import pulls, within
 from equivalent import answer, right_answers, same_place
 from generate import written
 
@@ -248,6 +249,7 @@ def scored(rows: list[Scored]) -> dict[str, Any]:
         "both_alone": share(double, both_alone),
         "calibration": calibration(rows),
         "closure": closures(single + double),
+        "deviations": within([p for c in single + double for p in pulls(c.label, c.found)]),
         "seconds": {
             "median": float(np.median([c.seconds for c in rows])) if rows else None,
             "worst": max((c.seconds for c in rows), default=None),
@@ -285,6 +287,17 @@ def percent(x: dict[str, Any]) -> str:
     return f"{100 * x['share']:.1f} % ({low:.0f} to {high:.0f}), {x['hits']} of {x['cases']}"
 
 
+def shares(x: dict[str, Any]) -> str:
+    """Of numbers within their deviations.
+
+    Args:
+        x: of `within`.
+    """
+    if not x["numbers"]:
+        return "no number"
+    return ", ".join(f"{100 * v:.0f}" for v in x["shares"]) + f" % of {x['numbers']}"
+
+
 def table(found: dict[str, Any]) -> str:
     """Markdown.
 
@@ -300,6 +313,7 @@ def table(found: dict[str, Any]) -> str:
         f"| places in the first set, outside the catalogue, mean | {number(found['unknown_set'])} | |",
         f"| closure against an oracle, median / lowest tenth | {number(closure['median'])} / "
         f"{number(closure['lowest_tenth'])} | 0.98 / 0.90 |",
+        f"| numbers within 1, 2, 3 of their standard deviations | {shares(found['deviations'])} | 68, 95, 99.7 % |",
         f"| time of a diagnosis, median / worst, s | {number(seconds['median'])} / {number(seconds['worst'])} | 45 |",
         f"| failures | {found['failures']} of {found['cases']} | 0 |",
     ]
