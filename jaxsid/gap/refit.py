@@ -439,9 +439,17 @@ def shot_of(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
 
 
 def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
+    """Normal priors; of the size of a law as wide as the one to begin with, where that is larger.
+
+    What lies so far beyond what was likely beforehand tells of a scale that was wrong: it would be drawn back to it.
+    """
     elements = bench.tolerance.copy()
     elements[list(hypothesis.wrong)] = bench.wide[list(hypothesis.wrong)]
-    own = np.asarray(shot.coordinates.deviation).ravel()
+    of = shot.coordinates
+    begun = np.abs(of.unknowns(parameter_rows(hypothesis.effects)))
+    sizes = (np.asarray(of.deviation) == 1.0) & ~np.asarray(of.logarithmic)
+    large = np.where(sizes, np.maximum(begun, 1.0), 1.0).ravel()
+    own = np.asarray(of.deviation).ravel() * large
     each = np.asarray(shot.coordinates.per_record).any(axis=1)
     shifts = np.tile(np.where(each, np.pi, FIXED), bench.records - 1)
     deviation = np.concatenate([elements, own, shifts])
@@ -452,7 +460,9 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
             np.full(len(shifts), -np.inf),
         ]
     )
-    most = np.where(np.arange(len(deviation)) < len(elements), MOST_ELEMENT, MOST_UNKNOWN)
+    most = np.full(len(deviation), MOST_UNKNOWN)
+    most[: len(elements)] = MOST_ELEMENT
+    most[len(elements) : len(elements) + len(large)] *= large
     states = bench.state_deviations(hypothesis.effects)
     return Prior(deviation, np.zeros(len(deviation)), least, most, states, bench.jump * states / LARGE)
 
