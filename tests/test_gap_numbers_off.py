@@ -1,6 +1,7 @@
 """Numbers that a fit holds for off: what one quick fit says of them, against a nominal model that is wrong in one."""
 
 from types import SimpleNamespace
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from gap_bench import bench, colored
 from gap_helpers import chain, drive, exact, silent
 
 from jaxsid.gap import search
+from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import NUMBERS
 from jaxsid.gap.numbers_off import hint, numbers_off
 from jaxsid.gap.refit import Hypothesis, refitted
@@ -56,7 +58,9 @@ def test_numbers_are_asked_for_where_what_no_law_explains_is_slight(
     monkeypatch.setattr(search, "changes_found", lambda found: "changes")
     monkeypatch.setattr(search, "attached_candidates", lambda look: ["spring"] * 9)
     monkeypatch.setattr(search, "_numbers", numbers)
-    examined = SimpleNamespace(noises=(), fit="fit", null="null", scored="places", finding=finding)
+    nothing = dict.fromkeys(Examination._fields)
+    told = {"noises": (), "fit": "fit", "null": "null", "scored": "places", "finding": finding}
+    examined = Examination(**cast(Any, {**nothing, **told}))
     found = search.searched(chain(), (), examined, silent)
     alone = ((Hypothesis(), "changes"), None, ["spring"] * search.LACKING)
     beside = ("laws", "places", ())
