@@ -118,6 +118,9 @@ def test_noise_that_was_measured_stands_unless_far_less_is_left_of_other_samples
     found = no_louder(measured, np.column_stack([np.full(400, part), np.full(400, 9.0)]))
     np.testing.assert_allclose(found.rms(), [1.0 if stands else part, 1.0], rtol=1e-3)
     assert (found.degrees, found.source) == (measured.degrees, measured.source)
+    # what takes up noise itself refutes none
+    still = no_louder(measured, np.full((400, 2), part), 0.0)
+    np.testing.assert_array_equal(still.level, measured.level)
 
 
 def test_lines_have_the_deviation_that_is_said():

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from coverage import pulls, within
+from deviations import pulls, within
 from equivalent import answer, right_answers, same_place
 from generate import written
 

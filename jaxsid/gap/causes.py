@@ -13,7 +13,7 @@ from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored
 from jaxsid.gap.measure import is_free_or_unstable
-from jaxsid.gap.noise import Noise, no_louder, quieter
+from jaxsid.gap.noise import REFUTED, Noise, no_louder, quieter
 from jaxsid.gap.null import Null, found_part
 from jaxsid.gap.ranking import WORTH, Explanation, Ranking
 from jaxsid.gap.refit import Hypothesis, Refit, changes_of, refitted
@@ -121,7 +121,9 @@ def causes_of(
     # what is left is noise where tests find nothing in it, else more than that
     less = partial(quieter, found=found_part(look.null, look.fit))
     told = bench.noises if look.clear else tuple(map(less, found.noises, bench.noises))
-    floor = tuple(map(no_louder, told, steps[-1].left))
+    # windows of a few samples take up noise themselves
+    refuted = REFUTED if motions is None else 0.0
+    floor = tuple(no_louder(n, x, refuted) for n, x in zip(told, steps[-1].left, strict=True))
     *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
     if motions is not None:
         later = ends  # no run tells what comes later

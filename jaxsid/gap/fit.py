@@ -23,9 +23,7 @@ EASED = 1e3  # factor by which damping falls where it held a step back
 IDLE = 2  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
 NONE = slice(0, 0)
-HALVINGS = (
-    5  # of how far a law is from what is likely beforehand, to begin with where it lets the motion grow
-)
+HALVINGS = 5  # of a law that lets the motion grow, towards what is likely beforehand, to begin with
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
 
 
