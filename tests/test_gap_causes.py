@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -234,6 +235,13 @@ def test_numbers_beyond_their_tolerance_are_candidates_farthest_first():
     assert again == ["stiffness_error"]
     still = found._replace(fit=found.fit._replace(theta=0 * theta))
     assert numbers_off(bench, still) == ()
+    # what is nothing nominally has no factor, however far it seems to be off
+    nominal = np.array(model.stiffness)
+    nominal[1] = 0.0
+    free = bench._replace(model=eqx.tree_at(lambda m: m.stiffness, model, jnp.asarray(nominal)))
+    gone = [c.kind for c in numbers_off(free, found)]
+    assert "stiffness_error" not in gone
+    assert "mass_error" in gone
 
 
 @pytest.mark.parametrize(("scored", "named"), [(None, 1), ("places", 0)])

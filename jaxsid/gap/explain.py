@@ -82,7 +82,8 @@ class Effort(NamedTuple):
 
 # with two effects a step costs several times as much
 FIRST, FURTHER = Effort(14, 4, 25, TEMPERATURE), Effort(16, 3, 16, TEMPERATURE)
-NUMBERS = Effort(12, 6, 25, MILD, math.inf)  # in noise guessed too low what colours it may be far ahead
+NUMBERS = Effort(12, 6, 25, MILD)
+ALONE = NUMBERS._replace(behind=math.inf)  # in noise guessed too low what colours it may be far ahead
 
 
 def element_place(model: LumpedModel, element: Element) -> dict[str, Any]:

@@ -23,7 +23,9 @@ def numbers_off(bench: Bench, found: Refit) -> tuple[Candidate, ...]:
     begin = changes_of(found, bench)
     new = lambda kind, place, parameters: Candidate(kind, place, parameters, begin, 0.0, np.nan, "", {})  # noqa: E731
     rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
-    off = [x for x in rows if far[list(x)].max() > OFF and not {*x} <= {*wrong}]
+    # what is nothing nominally has no factor
+    there = np.asarray(element_matrices(model).nominal) != 0
+    off = [x for x in rows if far[list(x)].max() > OFF and there[list(x)].any() and not {*x} <= {*wrong}]
     candidates = [new(ERRORS[listed[i].quantity], element_place(model, listed[i]), {}) for i, *_ in off]
     candidates[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
     candidates += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxsid.gap.closely import PARTED, begun_along, closely, parting, tightened
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
+    ALONE,
     FIRST,
     FURTHER,
     NUMBERS,
@@ -376,14 +377,15 @@ def _numbers(
     begun = len(at.selected)
     while len(at.selected) < MOST_EFFECTS and at.before is not None:
         off = numbers_off(at.bench, at.before)
-        least = TELLING if at.selected or at.look.scored is not None else 0.0
+        beside = bool(at.selected) or at.look.scored is not None
+        least, effort = (TELLING, NUMBERS) if beside else (0.0, ALONE)
         if not off or (
             least and not any(hint(at.bench, at.before, x, NUMBERS) > least / 2 for x in (*off, *lacking))
         ):
             return at
         # the number farthest off, what the model lacks, the others
         candidates = (*off[:1], *lacking, *off[1:])
-        ranking = rank(at.bench, candidates, at.before, NUMBERS, say)
+        ranking = rank(at.bench, candidates, at.before, effort, say)
         found = at.taken(ranking) if ranking.gain > least else at
         if found is at or not found.holds:
             at = at.refused(ranking)
