@@ -5,7 +5,7 @@ import pytest
 from gap_bench import bench, colored
 from gap_helpers import drive, exact
 
-from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of
+from jaxsid.gap.refit import FARTHEST, Hypothesis, _prior, refitted, shot_of
 from jaxsid.mechanics.lumped import Effect
 
 # offsets of a sensor, next to its signal
@@ -22,7 +22,7 @@ def shown():
     return colored(exact(drive()), 5)
 
 
-def test_the_prior_of_a_size_is_as_wide_as_what_it_begins_with(shown):
+def test_what_a_search_begins_with_is_never_farther_off_than_four_deviations(shown):
     of = bench(*shown)
 
     def deviation(hypothesis):
@@ -34,9 +34,9 @@ def test_the_prior_of_a_size_is_as_wide_as_what_it_begins_with(shown):
 
     level = shown[0][:, 1].std()
     (little, below), (large, beyond) = deviation(offset(LITTLE * level)), deviation(offset(-LARGE * level))
-    assert abs(below) < 1 < abs(beyond)
+    assert abs(below) < FARTHEST < abs(beyond)
     assert little == 1.0
-    assert large == pytest.approx(abs(beyond))
+    assert large == pytest.approx(abs(beyond) / FARTHEST)
 
 
 def test_a_large_law_is_not_drawn_to_none(shown):

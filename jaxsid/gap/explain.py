@@ -115,6 +115,16 @@ def elements_by_key(model: LumpedModel) -> dict[Key, tuple[int, ...]]:
     return found
 
 
+def nothing(model: LumpedModel, rows: Sequence[int]) -> bool:
+    """Whether numbers of a model are nothing nominally, so that no factor tells of them.
+
+    Args:
+        model: its elements.
+        rows: of the numbers; none are not nothing.
+    """
+    return bool(rows) and not np.asarray(element_matrices(model).nominal)[list(rows)].any()
+
+
 def rank(
     bench: Bench,
     candidates: Sequence[Candidate],
@@ -139,6 +149,7 @@ def rank(
     every = [
         (c, extended(base, c, errors), _changes(before, bench, c.changes))
         for c in _distinct(candidates, base, errors)
+        if not nothing(bench.model, errors.get(key_of(c.kind, c.place), ()))
     ]
     return _round(bench, every, without, effort, progress or (lambda text: None))
 

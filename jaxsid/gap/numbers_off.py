@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxsid.gap.explain import ERRORS, FINE, Effort, element_place, elements_by_key, extended
+from jaxsid.gap.explain import ERRORS, FINE, Effort, element_place, elements_by_key, extended, nothing
 from jaxsid.gap.refit import Bench, Refit, changes_of, refitted
 from jaxsid.gap.screen import Candidate
 from jaxsid.physical.elements import element_matrices
@@ -23,9 +23,7 @@ def numbers_off(bench: Bench, found: Refit) -> tuple[Candidate, ...]:
     begin = changes_of(found, bench)
     new = lambda kind, place, parameters: Candidate(kind, place, parameters, begin, 0.0, np.nan, "", {})  # noqa: E731
     rows = sorted(elements_by_key(model).values(), key=lambda x: -far[list(x)].max())
-    # what is nothing nominally has no factor
-    there = np.asarray(element_matrices(model).nominal) != 0
-    off = [x for x in rows if far[list(x)].max() > OFF and there[list(x)].any() and not {*x} <= {*wrong}]
+    off = [x for x in rows if far[list(x)].max() > OFF and not nothing(model, x) and not {*x} <= {*wrong}]
     candidates = [new(ERRORS[listed[i].quantity], element_place(model, listed[i]), {}) for i, *_ in off]
     candidates[1:1] = [new("input_gain", {"input": x.name}, {"factor": 1.0}) for x in model.inputs]
     candidates += [new("sensor_gain", {"sensor": x.name}, {"factor": 1.0}) for x in model.sensors]

@@ -36,6 +36,7 @@ from jaxsid.records import Record
 MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
 LEAST_ELEMENT = -0.95
+FARTHEST = 4.0  # deviations of its prior that the size of a law lies off
 JUMP = 0.02  # of the noise next to the signal: far less than a window tells of its states
 STEPS_A_PERIOD = 20.0  # of the quickest vibration
 MOST_SUBSTEPS = 8
@@ -439,7 +440,7 @@ def shot_of(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
 
 
 def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
-    """Normal priors; of the size of a law as wide as the one to begin with, where that is larger.
+    """Normal priors; of the size of a law so wide that the one to begin with is no more than `FARTHEST` deviations off.
 
     What lies so far beyond what was likely beforehand tells of a scale that was wrong: it would be drawn back to it.
     """
@@ -448,7 +449,7 @@ def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     of = shot.coordinates
     begun = np.abs(of.unknowns(parameter_rows(hypothesis.effects)))
     sizes = (np.asarray(of.deviation) == 1.0) & ~np.asarray(of.logarithmic)
-    large = np.where(sizes, np.maximum(begun, 1.0), 1.0).ravel()
+    large = np.where(sizes, np.maximum(begun / FARTHEST, 1.0), 1.0).ravel()
     own = np.asarray(of.deviation).ravel() * large
     each = np.asarray(shot.coordinates.per_record).any(axis=1)
     shifts = np.tile(np.where(each, np.pi, FIXED), bench.records - 1)
