@@ -63,18 +63,24 @@ def bench(y, level, u=None, model=None, wide=False):
     )
 
 
-def stepped(model, change):
-    """The linear chain with relative changes of its elements, sample by sample: x' = E x + F u, y = C x + D u."""
-    from scipy.linalg import expm
-
+def continuous(model, change):
+    """The linear chain with relative changes of its elements: A, and M^-1."""
     plain, elements = second_order(model), element_matrices(model)
     values = np.asarray(elements.nominal) * change
     M, D, K = (
         np.asarray(x) + np.einsum("e,eij->ij", values, np.asarray(d))
         for x, d in zip((plain.mass, plain.damping, plain.stiffness), elements.directions, strict=True)
     )
-    force = np.linalg.solve(M, np.asarray(plain.input_matrix))
     A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
+    return A, np.linalg.inv(M)
+
+
+def stepped(model, change):
+    """The same sample by sample: x' = E x + F u, y = C x + D u."""
+    from scipy.linalg import expm
+
+    A, inverse = continuous(model, change)
+    force = inverse @ np.asarray(second_order(model).input_matrix)
     B = np.concatenate([np.zeros((3, 1)), force])
     both = expm(np.block([[A, B], [np.zeros((1, 7))]]) * DT)
     return SimpleNamespace(E=both[:6, :6], F=both[:6, 6], C=A[3:], D=force[:, 0])

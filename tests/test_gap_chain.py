@@ -8,7 +8,7 @@ from gap_helpers import with_effect as truth
 
 from jaxsid.gap.chain import Chain, Links
 from jaxsid.gap.fit import _evaluated, _led, _normal, links_of
-from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of, tied
+from jaxsid.gap.refit import Hypothesis, prior_of, refitted, shot_of, tied
 from jaxsid.gap.setting import LARGE
 from jaxsid.mechanics.lumped import Effect
 
@@ -73,7 +73,7 @@ def test_each_window_leads_to_the_next(records):
 def test_derivatives_are_those_of_finite_differences(records, apart):
     chained = records._replace(jump=1e-2)
     hypothesis, shot = apart.hypothesis, shot_of(chained, apart.hypothesis.effects)
-    prior, links = _prior(chained, hypothesis, shot), links_of(chained.blocks)
+    prior, links = prior_of(chained, hypothesis, shot), links_of(chained.blocks)
     rng = np.random.default_rng(0)
     free = prior.deviation > 1e-6
     theta = apart.fit.theta + 1e-4 * free * rng.standard_normal(len(free))
@@ -102,7 +102,7 @@ def test_tied_windows_end_where_the_next_begin(records, apart):
     assert found.fit.evidence > apart.fit.evidence
     shot = shot_of(chained, found.hypothesis.effects)
     links = links_of(chained.blocks)
-    prior = _prior(chained, found.hypothesis, shot)
+    prior = prior_of(chained, found.hypothesis, shot)
     at = _evaluated(
         shot, chained.blocks, links, prior, found.fit.theta, list(found.fit.states), chained.substeps
     )
@@ -151,7 +151,7 @@ def straight():
 def test_states_alone_follow_at_once_where_all_is_linear(straight):
     chained, found = straight
     shot = shot_of(chained, ())
-    links, prior = links_of(chained.blocks), _prior(chained, Hypothesis(), shot)
+    links, prior = links_of(chained.blocks), prior_of(chained, Hypothesis(), shot)
     at = lambda states: _evaluated(shot, chained.blocks, links, prior, theta, states, chained.substeps)  # noqa: E731
     theta = found.fit.theta * 1.5
     before = at(list(found.fit.states))

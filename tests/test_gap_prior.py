@@ -5,7 +5,7 @@ import pytest
 from gap_bench import bench, colored
 from gap_helpers import drive, exact
 
-from jaxsid.gap.refit import FARTHEST, Hypothesis, _prior, refitted, shot_of
+from jaxsid.gap.refit import FARTHEST, Hypothesis, prior_of, refitted, shot_of
 from jaxsid.mechanics.lumped import Effect
 
 # offsets of a sensor, next to its signal
@@ -30,7 +30,7 @@ def test_what_a_search_begins_with_is_never_farther_off_than_four_deviations(sho
         z = shot.coordinates.unknowns(
             np.array([[x for x in e.parameters.values()] + [0.0] * 3 for e in hypothesis.effects])
         )
-        return _prior(of, hypothesis, shot).deviation[len(of.tolerance)], float(z[0, 0])
+        return prior_of(of, hypothesis, shot).deviation[len(of.tolerance)], float(z[0, 0])
 
     level = shown[0][:, 1].std()
     (little, below), (large, beyond) = deviation(offset(LITTLE * level)), deviation(offset(-LARGE * level))

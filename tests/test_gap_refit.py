@@ -30,10 +30,10 @@ from jaxsid.gap.ranking import density
 from jaxsid.gap.refit import (
     Hypothesis,
     Refit,
-    _prior,
     _with_own,
     as_guessed,
     loudest,
+    prior_of,
     refitted,
     shot_of,
     states_without,
@@ -170,7 +170,7 @@ def test_every_record_has_a_phase_of_its_own():
     # a fit that goes on begins with them
     fitted = effect("periodic_disturbance", "b2", amplitude=1.0, frequency_hz=3.0, phase=rows[:, 0, 2])
     np.testing.assert_allclose(shifts_of((fitted, delay), 3), [0.5, 0.0, -1.0, 0.0], rtol=1e-9)
-    deviation = _prior(of, Hypothesis((sine, delay)), shot).deviation[-4:]
+    deviation = prior_of(of, Hypothesis((sine, delay)), shot).deviation[-4:]
     np.testing.assert_allclose(deviation, [np.pi, 1e-9, np.pi, 1e-9])
 
 

@@ -7,7 +7,7 @@ from gap_helpers import DT, SAMPLES, SENSED, chain, drive, exact, record
 
 from jaxsid.gap.fit import _evaluated, _expected, _step, links_of
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import Hypothesis, _prior, refitted, shot_of
+from jaxsid.gap.refit import Hypothesis, prior_of, refitted, shot_of
 from jaxsid.gap.setting import slowest_rate
 from jaxsid.gap.windows import blocks_of, window_length
 from jaxsid.mechanics.lumped import Effect
@@ -18,7 +18,7 @@ def test_what_a_search_expects_is_what_a_full_step_brings():
     y, level = colored(exact(drive()), 2)
     of, nothing = bench(y, level, wide=True), Hypothesis()
     shot, links = shot_of(of, ()), links_of(())
-    prior, elements = _prior(of, nothing, shot), len(of.tolerance)
+    prior, elements = prior_of(of, nothing, shot), len(of.tolerance)
     begin = np.pad(np.full(elements, 1e-3), (0, shot.coordinates.centre.size))
     states = [np.pad(s, ((0, 0), (0, 2 * shot.slots.count))) for s in of.states]
     given = shot, of.blocks, links, prior

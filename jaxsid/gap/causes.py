@@ -6,20 +6,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsid.gap.any_law import any_law, smooth_places
 from jaxsid.gap.closely import motions_to_begin
 from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, later_than_effects, later_than_linear
 from jaxsid.gap.locate import Scored
+from jaxsid.gap.look import Look
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import REFUTED, Noise, no_louder, quieter
-from jaxsid.gap.null import Null, found_part
+from jaxsid.gap.null import SIGNIFICANT, Null, found_part
+from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import WORTH, Explanation, Ranking
-from jaxsid.gap.refit import Hypothesis, Refit, changes_of, refitted
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
 from jaxsid.gap.search import searched
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
+
+SURELY = 1e-9  # probability by chance below which a law of another shape is there
 
 
 class Causes(NamedTuple):
@@ -41,6 +46,7 @@ class Causes(NamedTuple):
             more than that.
         remaining: tests of what is left of the other samples.
         places: where that would arise; None where nothing is left.
+        unlisted: places where laws were found and one of another shape explains what these leave.
     """
 
     rounds: tuple[Ranking, ...]
@@ -56,6 +62,7 @@ class Causes(NamedTuple):
     places: Scored | None
     before: tuple[Left, Left]
     later: tuple[int, ...]
+    unlisted: tuple[Place, ...] = ()
 
     @property
     def bounded(self) -> bool:
@@ -109,6 +116,7 @@ def causes_of(
     linear = best_linear(bench, changes_of(chosen, bench))
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
+    unlisted = _unlisted(bench, look, selected, say)
     say("how far the gap shrinks")
     ends = tuple(len(r.y) for r in seen)
     motions = motions_to_begin(bench, whole, found.noises, found.scored)
@@ -145,7 +153,23 @@ def causes_of(
         None if look.clear else look.scored,
         before,
         later,
+        unlisted,
     )
+
+
+def _unlisted(
+    bench: Bench, look: Look, selected: Sequence[Explanation], say: Callable[[str], None]
+) -> tuple[Place, ...]:
+    """Places of laws found, where tests find anything, at which a law of another shape surely explains more.
+
+    Windows of a few samples forgive what would tell.
+    """
+    if not selected or look.null.p_value >= SIGNIFICANT or np.isfinite(bench.loose):
+        return ()
+    places = smooth_places(selected)
+    if places:
+        say("laws of any shape")
+    return tuple(p for p in places if any_law(bench, selected[-1].refit, p).p_value < SURELY)
 
 
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:

@@ -18,6 +18,7 @@ from scipy.stats import norm
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
+from jaxsid.gap.f_test import f_test
 from jaxsid.gap.innovations import coherence, innovations, unsteadiness
 from jaxsid.gap.input_noise import CERTAIN, LARGEST, InputNoise, input_noise, made, refitted, whitening
 from jaxsid.gap.noise import BANDS
@@ -38,7 +39,6 @@ LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
 HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
 MARGIN = 1.5  # times what it does on others that a law's share must be to be asked of those too
-DEPENDENT = 1e-7  # eigenvalue of columns of unit size below which a combination of them is nothing
 
 
 class Test(NamedTuple):
@@ -251,22 +251,8 @@ def _shapes_test(name: str, gram: np.ndarray, fit: Recalibrated) -> Test:
     """Of one place, elements out of the way first."""
     elements = len(fit.change)
     nuisances = elements + sum(len(s.transient) for s in fit.settings)
-    norm = np.sqrt(np.diag(gram))
-    gram = gram / np.where(norm > 0, norm, 1.0) / np.where(norm > 0, norm, 1.0)[:, None]
-    e = elements
-    own = gram[:e, :e] + 1e-10 * np.eye(e)
-    gram = gram[e:, e:] - gram[e:, :e] @ np.linalg.solve(own, gram[:e, e:])
-    values, vectors = np.linalg.eigh(gram[:-1, :-1])
-    seen = values > DEPENDENT
-    explained = float(((vectors[:, seen].T @ gram[:-1, -1]) ** 2 / values[seen]).sum())
-    rank, total = int(seen.sum()), float(gram[-1, -1])
-    if rank == 0 or total <= 0:
-        return Test(name, 1.0, 0.0)
-    rest = max(fit.equations - nuisances - rank, 1)
-    ratio = (explained / rank) / (max(total - explained, 1e-300) / rest)
-    p = float(betainc(rest / 2, rank / 2, rest / (rest + rank * ratio)))
-    excess = max(explained - (total - explained) * rank / rest, 0.0) / total
-    return Test(name, p, np.sqrt(excess) * left_share(fit))
+    found = f_test(gram, elements, fit.equations - nuisances)
+    return Test(name, found.p_value, np.sqrt(found.part) * left_share(fit))
 
 
 def _steady(fit: Recalibrated, settings: tuple[Setting, ...]) -> list[Test]:

@@ -411,7 +411,7 @@ def refitted(
     shot = shot_of(bench, effects)
     slots = shot.slots
     z = shot.coordinates.unknowns(parameter_rows(effects))
-    prior = _prior(bench, hypothesis, shot)
+    prior = prior_of(bench, hypothesis, shot)
     start = np.zeros(len(bench.tolerance)) if changes is None else np.asarray(changes)
     theta = np.concatenate([start, z.ravel(), shifts_of(effects, bench.records)])
     plain = 2 * len(bench.model.bodies)
@@ -439,7 +439,7 @@ def shot_of(bench: Bench, effects: tuple[Effect, ...]) -> Shot:
     return Shot(linear, element_directions(bench.model), slots, coordinates)
 
 
-def _prior(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
+def prior_of(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     """Normal priors; of the size of a law so wide that the one to begin with is no more than `FARTHEST` deviations off.
 
     What lies so far beyond what was likely beforehand tells of a scale that was wrong: it would be drawn back to it.

@@ -117,25 +117,43 @@ def products(given: Prepared, block: Block, states: Array) -> Products:
         block: windows.
         states: (windows, n) initial ones.
     """
-    rows = lambda x: jnp.moveaxis(x[block.record], 0, -1)  # noqa: E731
-    laws = Laws(given.kinds, rows(given.parameters), rows(given.parameter_slopes))
+    rows, found = _rows(given, block, states)
+    gram = jnp.einsum("wrp,wrq->wpq", rows, rows)
+    return Products(gram, (_counts(block) > 0).sum(axis=(1, 2)), *found)
+
+
+@compiled_in_full
+def slopes(given: Prepared, block: Block, states: Array) -> tuple[Float[Array, "windows rows q"], Array]:
+    """Rows of a block as noise is white in them, slopes and what is left as in `Products`; and what is left itself.
+
+    Args:
+        given: the hypothesis with its unknowns.
+        block: windows.
+        states: (windows, n) initial ones.
+    """
+    rows, (left, *_) = _rows(given, block, states)
+    return rows, left
+
+
+def _rows(given: Prepared, block: Block, states: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    own = lambda x: jnp.moveaxis(x[block.record], 0, -1)  # noqa: E731
+    laws = Laws(given.kinds, own(given.parameters), own(given.parameter_slopes))
     windows = Windows(
         block.u, block.ramps, block.lead, block.dt, block.first, states, block.y.shape[1] - block.lead
     )
     found = marched(given.own, given.slopes, laws, windows, given.substeps)
     turned = lambda x: jnp.moveaxis(x, -1, 0)  # noqa: E731
     left = turned(found.outputs).at[:, :, :, 0].add(-block.y)
-    counts = jax.vmap(lambda weight, taps: counted(weight[None], taps)[0])(block.weight, block.taps)[
-        :, block.lead :
-    ]
     white = _white(jnp.where(block.weight[..., None] > 0, left, 0.0), block.taps, block.lead)
-    rows = (white * counts[..., None]).reshape(len(left), -1, left.shape[-1])
+    rows = (white * _counts(block)[..., None]).reshape(len(left), -1, left.shape[-1])
     # the residual comes last
     rows = jnp.concatenate([rows[..., 1:], rows[..., :1]], axis=2)
-    gram = jnp.einsum("wrp,wrq->wpq", rows, rows)
-    return Products(
-        gram, (counts > 0).sum(axis=(1, 2)), left[..., 0], turned(found.forces), turned(found.ends)
-    )
+    return rows, (left[..., 0], turned(found.forces), turned(found.ends))
+
+
+def _counts(block: Block) -> Float[Array, "windows length outputs"]:
+    every = jax.vmap(lambda weight, taps: counted(weight[None], taps)[0])(block.weight, block.taps)
+    return every[:, block.lead :]
 
 
 def _white(left: Array, taps: Array, lead: int) -> Float[Array, "windows length outputs columns"]:
@@ -215,11 +233,24 @@ def products_of(
         states: of each block (windows, n), initial ones.
         substeps: steps for each sampling interval.
     """
+    each = ready_for(shot, blocks, theta, substeps)
+    return [products(x, b, jnp.asarray(s)) for x, b, s in zip(each, blocks, states, strict=True)]
+
+
+def ready_for(
+    shot: Shot, blocks: Sequence[Block], theta: Float[np.ndarray, " p"], substeps: int
+) -> list[Prepared]:
+    """A hypothesis with its unknowns, for each block; once for all of one sampling interval.
+
+    Args:
+        shot: the hypothesis.
+        blocks: windows.
+        theta: (p,) unknowns.
+        substeps: steps for each sampling interval.
+    """
     records = 1 + (len(theta) - len(shot.directions[0]) - shot.coordinates.centre.size) // shot.slots.count
     number, by_interval = jnp.asarray(substeps), {}
     for block in blocks:
         if (dt := float(block.dt)) not in by_interval:
             by_interval[dt] = ready(shot, jnp.asarray(theta), block.dt, records, number)
-    return [
-        products(by_interval[float(b.dt)], b, jnp.asarray(s)) for b, s in zip(blocks, states, strict=True)
-    ]
+    return [by_interval[float(b.dt)] for b in blocks]

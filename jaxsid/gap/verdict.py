@@ -27,6 +27,9 @@ LAPSE = 0.04  # share of development cases in which what explains all and is far
 # likewise where tests find more than noise in what it leaves, and that is over so much of what the linear model does
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
+OTHER = (
+    0.9  # probability that the law is not in the catalogue where one of another shape explains what it leaves
+)
 MISSED = 0.08  # of cases of the second test set where nothing explains enough: the catalogue holds the truth
 
 
@@ -37,7 +40,7 @@ class Verdict(NamedTuple):
         name: "none", "effect", "ambiguous" or "unknown".
         probability: of none, of an effect of the catalogue, of one that is not in it.
         likely: for each effect that was found, the explanations that are not told apart, most probable first.
-        imitating: effects of the catalogue that together look like one that is not in it.
+        imitating: effects of the catalogue that look like one that is not in it.
         paired: two laws at one place, where that is the most likely reason why none of the catalogue would be right.
     """
 
@@ -81,6 +84,8 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     unexplained, twofold = _unexplained(causes, found.finding), IMITATED if imitating else TWOFOLD
     paired = pairs[0] if pairs and twofold > unexplained else ()
     unexplained = twofold if paired else unexplained
+    if other := _instead_of_another(causes):
+        unexplained, imitating, paired = max(unexplained, OTHER), other, ()
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
@@ -133,6 +138,12 @@ def _imitating(pairs: list[tuple[Explanation, Explanation]], *, clear: bool) -> 
     of = lambda pair: [CATALOGUE[x.kind] for x in pair]  # noqa: E731
     springs = (p for p in pairs if all(k.restoring and not (clear and k.states) for k in of(p)))
     return next(springs, ())
+
+
+def _instead_of_another(causes: Causes) -> tuple[Explanation, ...]:
+    """Laws beside which one of another shape explains what they leave."""
+    at = {ends_of(p.as_dict()) for p in causes.unlisted}
+    return tuple(x for x in causes.selected if ends_of(x.place) in at and x.kind not in ERRORS.values())
 
 
 def _beside(causes: Causes) -> int:

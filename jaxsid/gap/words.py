@@ -117,8 +117,9 @@ def summary(found: Found) -> tuple[str, str]:
                 shrinks,
             )
         place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
-        both = " and ".join(map(named, found.judgement.imitating))
-        told = f" Together, {both} imitate it." if both else ""
+        near = " and ".join(map(named, found.judgement.imitating))
+        one = f" What comes near it is {near}." if near else ""
+        told = f" Together, {near} imitate it." if len(found.judgement.imitating) > 1 else one
         return (
             f"The model lacks something that no kind of effect in the catalogue explains.{place}{told}",
             shrinks,

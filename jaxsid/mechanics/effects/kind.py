@@ -121,6 +121,7 @@ class Kind(NamedTuple):
         vibrates: rad/s at which a part of its own swings, from its parameters in their order.
         steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
         restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
+        timed: whether its force goes by the time, too.
     """
 
     name: str
@@ -139,6 +140,13 @@ class Kind(NamedTuple):
     vibrates: Callable[..., float] | None = None
     steady: bool = False
     restoring: bool = False
+    timed: bool = False
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it is a function of displacement and velocity between two ends, without jumps or memory."""
+        of_bodies = self.where in ("between", "body")
+        return of_bodies and self.slip is None and self.states == 0 and not self.timed
 
 
 def power(x: Array, exponent: Array) -> Array:

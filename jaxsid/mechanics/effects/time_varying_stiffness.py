@@ -20,4 +20,5 @@ EFFECT = Kind(
     about="Warming, loosening or damage during the measurement.",
     source="K. Liu, J. Sound Vib. 206 (1997).",
     force=_force,
+    timed=True,
 )
