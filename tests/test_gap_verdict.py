@@ -130,6 +130,29 @@ def test_a_law_near_enough_stands_though_tests_are_sure_that_it_is_not_exact():
     assert verdict.probability["unknown"] < 0.35
 
 
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("coulomb_friction", "effect"),
+        ("stribeck_friction", "effect"),
+        ("hysteresis", "effect"),
+        ("cubic_stiffness", "unknown"),
+        ("backlash", "unknown"),
+    ],
+)
+def test_friction_and_hysteresis_need_not_be_as_exact_as_smooth_laws(kind, name):
+    def said(gap):
+        left = closure(math.hypot(0.3 * gap, 0.01), recalibrated=math.hypot(0.3, 0.01))
+        return verdict_of(
+            examination(),
+            causes(ranking(0.0, -500.0, kinds=[(kind, B12), ("end_stop", B23)]), closures=[left]),
+        )
+
+    assert said(0.3).name == name
+    # what leaves half of it explains nothing
+    assert said(0.5).name == "unknown"
+
+
 def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_rest(monkeypatch):
     monkeypatch.setattr("jaxsid.gap.verdict._beside", lambda found: 0)
     idle = closure(0.99 * 0.3, floor=0.99 * 0.3)

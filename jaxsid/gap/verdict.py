@@ -16,7 +16,7 @@ from jaxsid.mechanics.effects.catalogue import CATALOGUE
 
 LIKELY = 0.9  # probability that the explanations named have together
 ENOUGH = 0.6  # part of the best linear model's gap, on held-out samples, below which nothing explains it
-MORE = 0.8  # likewise, where more than noise is left
+MORE = 0.8  # likewise, where more than noise is left and no dry friction or hysteresis was found
 SURE = 1.1  # what is left over the noise floor from which on that is so
 STEEP = 8.0  # how fast the probability of "unknown" grows about that
 MOST = 0.5  # part of what was left that an effect beside an unknown one explains
@@ -107,7 +107,10 @@ def _unexplained(causes: Causes, finding: str) -> float:
     structure = finding == "structure"
     more = structure and last.after > SURE * last.noise_floor
     beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
-    gone, enough = last.against_recalibrated if beyond else last.fraction, MORE if more else ENOUGH
+    # real friction and hysteresis are richer than any law of theirs, which counts where it explains most
+    rough = any(CATALOGUE[x.kind].rubs for x in causes.selected)
+    gone = last.against_recalibrated if beyond else last.fraction
+    enough = MORE if more and not rough else ENOUGH
     lapse = LAPSE
     if structure and not more and causes.places is not None and last.after > SHRUNK * last.recalibrated:
         # noise whose level is guessed takes up what no law explains, so that nearly all seems gone

@@ -148,6 +148,11 @@ class Kind(NamedTuple):
         of_bodies = self.where in ("between", "body")
         return of_bodies and self.slip is None and self.states == 0 and not self.timed
 
+    @property
+    def rubs(self) -> bool:
+        """Whether surfaces rub: dry friction, or a force that follows the displacement with a memory."""
+        return self.slip is not None or (self.restoring and self.states > 0)
+
 
 def power(x: Array, exponent: Array) -> Array:
     """|x|^exponent with finite derivatives at zero, for exponents of at least 1."""
