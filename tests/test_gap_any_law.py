@@ -8,14 +8,16 @@ import scipy.signal
 import scipy.stats
 from effects_truth import Chain, Truth
 from gap_bench import bench, colored, continuous, stepped, whitened, windows_of
-from gap_helpers import DT, JOINT, SENSED, chain, drive
+from gap_helpers import DT, JOINT, SENSED, chain, drive, silent
 from test_gap_verdict import causes, closure, examination, ranking
 
 from jaxsid.gap.any_law import any_law, smooth_places
 from jaxsid.gap.causes import _unlisted
 from jaxsid.gap.f_test import f_test
+from jaxsid.gap.look import Look
+from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
-from jaxsid.gap.refit import Hypothesis, refitted
+from jaxsid.gap.refit import Bench, Hypothesis, refitted
 from jaxsid.gap.verdict import LAPSE, OTHER, verdict_of
 from jaxsid.mechanics.lumped import Effect, second_order
 
@@ -41,6 +43,12 @@ def reading(kind, parameters, law=None):
 def fitted_to(y, level, hypothesis=CUBIC):
     of = bench(y, level)
     return of, refitted(of, hypothesis)
+
+
+def left(p_value, scored, loose=np.inf):
+    """A bench, and a look at what is left."""
+    of = Bench(**dict.fromkeys(Bench._fields))._replace(loose=loose)
+    return of, Look(None, Null(p_value, 0.1, (), ()), scored)
 
 
 def least_squares(columns, y):
@@ -191,15 +199,18 @@ def test_asked_where_tests_find_anything(monkeypatch, p_value, chance, loose, as
 
     monkeypatch.setattr("jaxsid.gap.causes.any_law", stand_in)
     selected = ranking(0.0, kinds=[("cubic_stiffness", B12.as_dict())]).ranked[:1]
-    of = SimpleNamespace(loose=loose)
-    look = SimpleNamespace(null=SimpleNamespace(p_value=p_value))
     said = []
-    found = (
-        _unlisted.__wrapped__(of, look, selected, said.append) if hasattr(_unlisted, "__wrapped__") else None
-    )
-    assert found is not None
+    found = _unlisted(*left(p_value, None, loose), selected, said.append)
     assert found == ((B12,) if asked else ())
     assert bool(called) == bool(said) == (asked is not None)
+
+
+@pytest.mark.parametrize(("left_at", "told"), [((B12,), (B12,)), ((B23, B12), (B12,)), ((B23,), ())])
+def test_what_arises_elsewhere_is_for_another_effect(monkeypatch, left_at, told):
+    monkeypatch.setattr("jaxsid.gap.causes.any_law", lambda *_: SimpleNamespace(p_value=0.0))
+    monkeypatch.setattr("jaxsid.gap.causes.located", lambda x: SimpleNamespace(likely=x))
+    selected = ranking(0.0, kinds=[("cubic_stiffness", {"between": ("b2", "b1")})]).ranked[:1]
+    assert _unlisted(*left(0.0, left_at), selected, silent) == told
 
 
 def test_a_law_beside_which_another_is_sure_is_not_in_the_catalogue():

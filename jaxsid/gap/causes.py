@@ -12,13 +12,13 @@ from jaxsid.gap.closure import Closure, Left, closure_of, left_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, later_than_effects, later_than_linear
-from jaxsid.gap.locate import Scored
+from jaxsid.gap.locate import Scored, located
 from jaxsid.gap.look import Look
 from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import REFUTED, Noise, no_louder, quieter
 from jaxsid.gap.null import SIGNIFICANT, Null, found_part
 from jaxsid.gap.places import Place
-from jaxsid.gap.ranking import WORTH, Explanation, Ranking
+from jaxsid.gap.ranking import WORTH, Explanation, Ranking, ends_of
 from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
 from jaxsid.gap.search import searched
 from jaxsid.mechanics.lumped import LumpedModel
@@ -162,11 +162,14 @@ def _unlisted(
 ) -> tuple[Place, ...]:
     """Places of laws found, where tests find anything, at which a law of another shape surely explains more.
 
-    Windows of a few samples forgive what would tell.
+    Windows of a few samples forgive what would tell. What more probably arises elsewhere is for another effect.
     """
     if not selected or look.null.p_value >= SIGNIFICANT or np.isfinite(bench.loose):
         return ()
-    places = smooth_places(selected)
+    places, at = smooth_places(selected), look.scored
+    if at is not None:
+        likely = {ends_of(p.as_dict()) for p in located(at).likely}
+        places = tuple(p for p in places if ends_of(p.as_dict()) in likely)
     if places:
         say("laws of any shape")
     return tuple(p for p in places if any_law(bench, selected[-1].refit, p).p_value < SURELY)
