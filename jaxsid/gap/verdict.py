@@ -80,7 +80,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         some = float(sum(x.probability for r in causes.rounds[:1] for x in r.ranked))
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     pairs = _at_one_place(causes.selected)
-    imitating = _imitating(pairs, clear=causes.places is None)
+    imitating = _imitating(pairs)
     unexplained, twofold = _unexplained(causes, found.finding), IMITATED if imitating else TWOFOLD
     paired = pairs[0] if pairs and twofold > unexplained else ()
     unexplained = twofold if paired else unexplained
@@ -129,17 +129,14 @@ def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, 
     ]
 
 
-def _imitating(pairs: list[tuple[Explanation, Explanation]], *, clear: bool) -> tuple[Explanation, ...]:
-    """Two springs that are not straight: more often one curve of neither's shape than both at once.
-
-    A loop is no curve: with it, where nothing is left, both are there.
+def _imitating(pairs: list[tuple[Explanation, Explanation]]) -> tuple[Explanation, ...]:
+    """Two springs that are not straight, neither a loop: more often one curve of neither's shape than both at once.
 
     Args:
         pairs: at one place each.
-        clear: whether tests find nothing in what is left.
     """
     of = lambda pair: [CATALOGUE[x.kind] for x in pair]  # noqa: E731
-    springs = (p for p in pairs if all(k.restoring and not (clear and k.states) for k in of(p)))
+    springs = (p for p in pairs if all(k.restoring and k.states == 0 for k in of(p)))
     return next(springs, ())
 
 
