@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
@@ -18,6 +19,7 @@ from jaxsid.gap.look import Look
 from jaxsid.gap.null import Null
 from jaxsid.gap.places import Place
 from jaxsid.gap.refit import Bench, Hypothesis, refitted
+from jaxsid.gap.shooting import slopes
 from jaxsid.gap.verdict import LAPSE, OTHER, verdict_of
 from jaxsid.mechanics.lumped import Effect, second_order
 
@@ -165,6 +167,16 @@ def test_a_law_that_stands_for_another_leaves_it_what_that_has_of_its_own(law):
     assert told.part > 0.8 * beyond
 
 
+def test_motion_that_grows_without_bound_tells_nothing(monkeypatch):
+    def grown(*given):
+        rows, lefts = slopes(*given)
+        return jnp.full_like(rows, jnp.nan), lefts
+
+    of, found = fitted_to(*reading("cubic_stiffness", {"coefficient": 1e5}))
+    monkeypatch.setattr("jaxsid.gap.any_law.slopes", grown)
+    assert any_law(of, found, B12) == (1.0, 0.0)
+
+
 def test_places_of_smooth_laws_alone():
     def of(*found):
         return smooth_places([ranking(0.0, kinds=[x]).ranked[0] for x in found])
@@ -172,7 +184,8 @@ def test_places_of_smooth_laws_alone():
     here, wall = {"between": ("b1", "b2")}, {"between": ("ground", "b1")}
     assert of(("cubic_stiffness", here)) == (B12,)
     assert of(("cubic_stiffness", here), ("end_stop", {"between": ("b2", "b1")})) == (B12,)
-    assert of(("constant_load", {"body": "b1"})) == (Place("between", ("b1", "ground")),)
+    assert of(("quadratic_damping", wall)) == (Place("between", ("b1", "ground")),)
+    assert of(("constant_load", {"body": "b1"}), ("cubic_stiffness", here)) == (B12,)
     # dry friction, memory, time, numbers and signals are no sum of shapes
     assert of(("coulomb_friction", here), ("cubic_stiffness", here)) == ()
     assert of(("constant_load", {"body": "b1"}), ("coulomb_friction", wall)) == ()

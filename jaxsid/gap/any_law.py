@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxsid.gap.f_test import FTest, f_test
 from jaxsid.gap.places import Place, joint_of
@@ -30,7 +30,8 @@ SMALL = 1e-4  # of the force that moves the bodies there: a law is as good as st
 def smooth_places(selected: Sequence[Explanation]) -> tuple[Place, ...]:
     """Where laws were found, all of which such a sum could be.
 
-    Dry friction and hysteresis are richer at small speeds than any law of theirs, and no sum is in their place.
+    Dry friction and hysteresis are richer at small speeds than any law of theirs, and no sum is in their place. A load
+    that is the same at all times is no law of the motion, and is there whatever else is.
 
     Args:
         selected: what was found.
@@ -38,8 +39,9 @@ def smooth_places(selected: Sequence[Explanation]) -> tuple[Place, ...]:
     at: dict[tuple[str, ...], bool] = {}
     for x in selected:
         where, *ends = ends_of(x.place)
-        if where == "between" and x.kind not in ERRORS.values():
-            at[tuple(ends)] = at.get(tuple(ends), True) and CATALOGUE[x.kind].smooth
+        kind = CATALOGUE[x.kind]
+        if where == "between" and x.kind not in ERRORS.values() and not kind.steady:
+            at[tuple(ends)] = at.get(tuple(ends), True) and kind.smooth
     return tuple(Place("between", ends) for ends, smooth in at.items() if smooth)
 
 
@@ -58,7 +60,9 @@ def any_law(bench: Bench, found: Refit, place: Place) -> FTest:
     parts = [slopes(*x) for x in zip(each, blocks, map(jnp.asarray, found.fit.states), strict=True)]
     rows, lefts = ([np.asarray(x[i]) for x in parts] for i in (0, 1))
     motions = [x[..., -2:] for x in lefts]
-    largest = [np.abs(m * _told(b)).max(axis=(0, 1)) for m, b in zip(motions, blocks, strict=True)]
+    largest = [
+        np.abs(np.where(_told(b), m, 0.0)).max(axis=(0, 1)) for m, b in zip(motions, blocks, strict=True)
+    ]
     every = [_shapes(m, np.max(largest, axis=0)) for m in motions]
     small = SMALL * _force(shot, joint, blocks, motions)
     columns = [
@@ -73,10 +77,10 @@ def any_law(bench: Bench, found: Refit, place: Place) -> FTest:
     gram = np.sum(grams, axis=0)
     # what is likely beforehand counts like any other row
     prior, row = prior_of(bench, found.hypothesis, found.shot), np.zeros((unknowns, len(gram)))
-    row[:, :unknowns], row[:, -1] = (
-        np.diag(1 / prior.deviation),
-        (found.fit.theta - prior.mean) / prior.deviation,
-    )
+    row[:, :unknowns] = np.diag(1 / prior.deviation)
+    row[:, -1] = (found.fit.theta - prior.mean) / prior.deviation
+    if not np.isfinite(gram).all():  # a law that lets the motion grow may let a small force carry it away
+        return FTest(1.0, 0.0)
     windows = sum(len(s) for s in found.fit.states)
     fitted = unknowns + windows * found.fit.states[0].shape[1]
     return f_test(gram + row.T @ row, unknowns, found.fit.equations - fitted)
@@ -123,16 +127,16 @@ def _with_force(block: Block, force: Float[np.ndarray, "windows length"] | None 
     )
 
 
-def _told(block: Block) -> Float[np.ndarray, "windows 1 1"]:
-    """1 for windows where anything was measured."""
-    return 1.0 * np.asarray((block.weight > 0).any(axis=(1, 2)))[:, None, None]
+def _told(block: Block) -> Bool[np.ndarray, "windows 1 1"]:
+    """Windows where anything was measured."""
+    return np.asarray((block.weight > 0).any(axis=(1, 2)))[:, None, None]
 
 
 def _force(shot: Shot, joint: np.ndarray, blocks: Sequence[Block], motions: Sequence[np.ndarray]) -> float:
     """Rms of the force that accelerates what hangs there."""
     mass = float(joint @ np.asarray(shot.linear.mass) @ joint)
     pairs = zip(motions, blocks, strict=True)
-    moved = [np.diff(m[..., 1] * _told(b)[..., 0], axis=1) / float(b.dt) for m, b in pairs]
+    moved = [np.diff(np.where(_told(b)[..., 0], m[..., 1], 0.0), axis=1) / float(b.dt) for m, b in pairs]
     return mass * float(np.sqrt(np.mean([(x**2).mean() for x in moved])))
 
 
