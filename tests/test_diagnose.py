@@ -150,6 +150,18 @@ def test_the_summary(cubic, capsys):
     assert "Where it arises" in told
 
 
+def test_the_summary_says_what_comes_near_an_unknown_law(cubic):
+    (law,) = cubic.causes.selected
+
+    def said(*near):
+        judgement = cubic.judgement._replace(name="unknown", imitating=near)
+        return cubic._replace(judgement=judgement).summary[0]
+
+    assert said().endswith("Its place is most likely b1 - b2.")
+    assert said(law).endswith("What comes near it is cubic stiffness between b1 and b2.")
+    assert "Together, cubic stiffness between b1 and b2 and cubic stiffness" in said(law, law)
+
+
 @pytest.mark.slow
 def test_wrong_numbers_are_named():
     u = drive()

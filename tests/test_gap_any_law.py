@@ -9,9 +9,10 @@ import scipy.signal
 import scipy.stats
 from effects_truth import Chain, Truth
 from gap_bench import bench, colored, continuous, stepped, whitened, windows_of
-from gap_helpers import DT, JOINT, SENSED, chain, drive, silent
+from gap_helpers import DT, JOINT, SENSED, chain, drive, record, silent
 from test_gap_verdict import causes, closure, examination, ranking
 
+from jaxsid import diagnose
 from jaxsid.gap.any_law import any_law, smooth_places
 from jaxsid.gap.causes import _unlisted
 from jaxsid.gap.f_test import f_test
@@ -165,6 +166,16 @@ def test_a_law_that_stands_for_another_leaves_it_what_that_has_of_its_own(law):
     # nearly all of what is left
     beyond = 1 - found.fit.equations / found.fit.squares
     assert told.part > 0.8 * beyond
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "verdict"), [(lambda d, v: 3e4 * d**2 * v, "unknown"), (lambda d, v: 1e6 * d**3, "effect")]
+)
+def test_a_law_that_is_not_in_the_catalogue_is_unknown_at_its_place(law, verdict):
+    found = diagnose(chain(), record(drive(), reading("none", {}, law)[0]))
+    assert found.verdict == verdict
+    assert found.examination.locations.ranked[0].place == B12
 
 
 def test_motion_that_grows_without_bound_tells_nothing(monkeypatch):
