@@ -150,7 +150,7 @@ def test_the_summary(cubic, capsys):
     assert "Where it arises" in told
 
 
-def test_the_summary_says_what_comes_near_an_unknown_law(cubic):
+def test_the_summary_says_what_comes_near_an_unknown_law(cubic, monkeypatch):
     (law,) = cubic.causes.selected
 
     def said(*near):
@@ -160,6 +160,14 @@ def test_the_summary_says_what_comes_near_an_unknown_law(cubic):
     assert said().endswith("Its place is most likely b1 - b2.")
     assert said(law).endswith("What comes near it is cubic stiffness between b1 and b2.")
     assert "Together, cubic stiffness between b1 and b2 and cubic stiffness" in said(law, law)
+    # as it does where the numbers are far off
+    far = cubic._replace(
+        judgement=cubic.judgement._replace(name="unknown", imitating=(law,)),
+        causes=cubic.causes.first(0),
+    )
+    monkeypatch.setattr(type(cubic.examination), "far_off", True)
+    assert "far from these records" in far.summary[0]
+    assert far.summary[0].endswith("What comes near it is cubic stiffness between b1 and b2.")
 
 
 @pytest.mark.slow

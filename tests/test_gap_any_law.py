@@ -22,6 +22,7 @@ from jaxsid.gap.places import Place
 from jaxsid.gap.refit import Bench, Hypothesis, refitted
 from jaxsid.gap.shooting import slopes
 from jaxsid.gap.verdict import LAPSE, OTHER, verdict_of
+from jaxsid.gap.words import about_doubt
 from jaxsid.mechanics.lumped import Effect, second_order
 
 B12, B23 = Place("between", ("b1", "b2")), Place("between", ("b2", "b3"))
@@ -252,3 +253,8 @@ def test_a_law_beside_which_another_is_sure_is_not_in_the_catalogue():
     assert doubt.probability["unknown"] == OTHER
     assert [x.kind for x in doubt.imitating] == ["cubic_stiffness"]
     assert not doubt.paired
+    # the reader is told why what leaves so little is not taken
+    (reason,) = about_doubt(found._replace(unlisted=(B12,)), doubt)
+    assert "cubic stiffness between b2 and b1" in reason
+    assert "another shape" in reason
+    assert about_doubt(found, sure) == []

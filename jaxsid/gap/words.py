@@ -113,15 +113,13 @@ def summary(found: Found) -> tuple[str, str]:
         if found.far_off:
             return (
                 "The model's numbers are far from these records, and no kind of effect in the catalogue explains what "
-                "is left with better ones.",
+                f"is left with better ones.{_near(found.judgement.imitating)}",
                 shrinks,
             )
         place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
-        near = " and ".join(map(named, found.judgement.imitating))
-        one = f" What comes near it is {near}." if near else ""
-        told = f" Together, {near} imitate it." if len(found.judgement.imitating) > 1 else one
         return (
-            f"The model lacks something that no kind of effect in the catalogue explains.{place}{told}",
+            "The model lacks something that no kind of effect in the catalogue explains."
+            f"{place}{_near(found.judgement.imitating)}",
             shrinks,
         )
     if not causes.selected:
@@ -133,14 +131,28 @@ def summary(found: Found) -> tuple[str, str]:
     return f"{what[0].upper()}{what[1:]}.", shrinks
 
 
+def _near(imitating: tuple[Explanation, ...]) -> str:
+    """What of the catalogue looks like a law that is not in it, if anything does."""
+    said = " and ".join(map(named, imitating))
+    if len(imitating) > 1:
+        return f" Together, {said} imitate it."
+    return f" What comes near it is {said}." if imitating else ""
+
+
 def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
-    """Why effects that were found are not sure, where that is for what the catalogue does not hold.
+    """Why effects that were found are not sure, or not taken, where that is for what the catalogue does not hold.
 
     Args:
         causes: what was found.
         verdict: what is concluded of it.
     """
     unknown = verdict.probability["unknown"]
+    if causes is not None and causes.unlisted and verdict.imitating:
+        said = " and ".join(map(named, verdict.imitating))
+        return [
+            f"However near {said} may come: a force of another shape, of displacement and velocity there, explains "
+            "more of what it leaves than chance ever does. The law is not in the catalogue, or another acts there, too."
+        ]
     if causes is None or not causes.selected or verdict.name == "unknown" or unknown < DOUBTED:
         return []
     doubt = f"A probability of {unknown:.2f} is left for what the catalogue does not hold:"
