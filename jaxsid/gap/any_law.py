@@ -81,7 +81,7 @@ def any_law(bench: Bench, found: Refit, place: Place) -> FTest:
     row[:, -1] = (found.fit.theta - prior.mean) / prior.deviation
     if not np.isfinite(gram).all():  # a law that lets the motion grow may let a small force carry it away
         return FTest(1.0, 0.0)
-    windows = sum(len(s) for s in found.fit.states)
+    windows = sum(int(_told(b).sum()) for b in blocks)
     fitted = unknowns + windows * found.fit.states[0].shape[1]
     return f_test(gram + row.T @ row, unknowns, found.fit.equations - fitted)
 

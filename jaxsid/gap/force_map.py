@@ -20,6 +20,7 @@ from jaxsid.mechanics.lumped import LumpedModel, second_order
 
 UNSEEN = 1e-9  # of the largest response to a force: one that is rounding
 LARGEST = 10.0  # steady part of a force, which no sensor sees, next to the rms of the rest
+SLIGHT = 1e-9  # of a motion: what else moves it each sample, so that one that grows by itself is followed too
 ABSENT = 1e6  # noise of a sensor that a record lacks, next to that of the others
 
 
@@ -108,9 +109,11 @@ def _smoothed(
     moved = (spectra.forced_states @ joint) * force[:, None]
     rates = jnp.stack([force, 1j * spectra.omega * force], axis=1)
     start = jnp.concatenate([in_time(spectra, moved)[0], in_time(spectra, rates)[0]])
+    states = in_time(spectra, made.motion.states)
     latent = latent_model(*system, size, rate, level, spectra.dt)
-    found = smooth(latent, y, start)
-    q, v = jnp.split(in_time(spectra, made.motion.states), 2, axis=1)
+    slight = jnp.zeros(len(latent.Q)).at[: states.shape[1]].set(SLIGHT**2 * (states**2).mean(axis=0))
+    found = smooth(latent._replace(Q=latent.Q + jnp.diag(slight)), y, start)
+    q, v = jnp.split(states, 2, axis=1)
     n = len(start) - 2
     rest = jnp.sqrt(2 * (jnp.abs(force) ** 2).sum())
     steady = jnp.where(used[0], 0.0, _steady_force(spectra, made, joint, LARGEST * rest)) / np.sqrt(
