@@ -1,8 +1,10 @@
 """Places of single effects in records of the reference integration, sets, forces, several records, bad input."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gap_helpers import DT, JOINT, SENSED, WALL, chain, drive, exact, noisy, record, with_effect
+from scipy.linalg import expm
 
 from jaxsid.checks import InputError
 from jaxsid.gap.locate import locate
@@ -53,6 +55,17 @@ def sliding(mass=95.0, damping=203.0, friction=20.0, dt=0.004, samples=2048, par
             after = free - np.clip(free, -gain * friction, gain * friction)
             q, v = q + dt / parts * (v + after) / 2, after
     return push, np.array(found)
+
+
+def balanced(samples=1024):
+    """Push and displacement of an inverted pendulum that a controller holds up, input held over each sample."""
+    A, push, found, x = np.array([[0.0, 1.0], [4.0, -0.5]]), drive(samples), [], np.zeros(2)
+    step = expm(np.block([[A, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) * DT)
+    for k in range(samples):
+        found.append(x[0])
+        push[k] -= 40 * x[0] + 9 * x[1]
+        x = step[:2, :2] @ x + step[:2, 2] * push[k]
+    return push, np.array(found)[:, None]
 
 
 @pytest.mark.parametrize(("kind", "place", "parameters", "expected"), CASES)
@@ -129,6 +142,23 @@ def test_force_is_that_of_the_law():
     error = (found.force - expected)[inner]
     assert np.sqrt((error**2).mean()) < 0.2 * expected.std()
     assert 0 < found.deviation < 0.3 * expected.std()
+
+
+def test_error_of_a_sensor_of_an_unstable_model_is_followed():
+    model = lumped_model(
+        ["m"],
+        matrices=Matrices(*(jnp.array([[x]]) for x in (1.0, 0.5, -4.0))),
+        inputs=[Input("drive", "m")],
+        sensors=[Sensor("s0", "m", "displacement"), Sensor("s1", "m", "displacement")],
+    )
+    u, y = balanced()
+    y = np.concatenate([y, y], axis=1)
+    error = 0.5 * y.std() * np.convolve(drive(len(y), seed=7), np.hanning(40) / 40, "same") / 10
+    measured = noisy(y + np.stack([error, 0 * error], axis=1))
+    found = locate(model, record(u, measured, kinds=((0, "displacement"), (1, "displacement"))))
+    assert found.likely == (Place("sensor", ("s0",)),)
+    (one,) = found.maps
+    assert np.sqrt(np.mean((one.force - error) ** 2)) < 0.1 * error.std()
 
 
 @pytest.mark.slow
