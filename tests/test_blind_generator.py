@@ -341,6 +341,22 @@ def test_the_library_reads_what_is_written(tmp_path):
     np.testing.assert_allclose(np.asarray(record.y), case.records[0][:, 1:], rtol=1e-8, atol=1e-300)
 
 
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_a_sampled_loop_that_runs_away_is_told(sensor):
+    """By its poles, against the motion itself; a free axis under feedback of its velocity drifts, no more."""
+    drive = np.random.default_rng(0).standard_normal(300)
+    told, grown = [], []
+    for rate in 10.0 ** np.arange(0, 4):
+        loop = Loop(sensor, rate, 0.3 * rate if sensor == 0 else 0.0)
+        told.append(draw._grows(MASS, loop))
+        y = np.abs(respond(MASS, (), drive, loop=loop).y[:, 1])
+        grown.append(bool(y[-50:].max() > 100 * y[:50].max()))
+    assert told == grown
+    assert {True, False} == set(told)
+    free = MASS._replace(connections=(systems.Connection("c", ("ground", "b1"), 0.0, 1.0),))
+    assert not draw._grows(free, Loop(1, 1.0, 0.0))
+
+
 def labelled(kind: str, place: dict, sensors: tuple = CHAIN.sensors, **more) -> dict:
     """A label as `score` reads it."""
     system = CHAIN._replace(sensors=sensors)

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.signal
 from excitation import drawn as signal_of
 from families import FAMILIES, deviating, sensors
@@ -22,6 +23,7 @@ CHANGES = (0.01, 0.6)  # of the response
 EXACT = 0.05  # largest change, in noise, when steps are halved
 MOST_STEPS = 192
 SAMPLES = (10_000, 5_000)
+NEUTRAL = 1e-9  # what rounding adds to a pole at one
 LEVELS = (0.4, 2.0)  # of the second record next to the first
 
 
@@ -119,9 +121,29 @@ def _loop(rng: np.random.Generator, system: System) -> Loop | None:
         return None
     mass, w = system.mass[system.bodies.index(body)], frequencies(system)[0]
     rate = 2 * rng.uniform(0.03, 0.15) * w * mass
-    if system.sensors[at[0]].kind == "velocity":
-        return Loop(at[0], rate, 0.0)
-    return Loop(at[0], rng.uniform(0.05, 0.3) * w**2 * mass, rate)
+    loop = Loop(at[0], rate, 0.0)
+    if system.sensors[at[0]].kind == "displacement":
+        loop = Loop(at[0], rng.uniform(0.05, 0.3) * w**2 * mass, rate)
+    while _grows(system, loop):
+        loop = loop._replace(gain=loop.gain / 2, rate_gain=loop.rate_gain / 2)
+    return loop
+
+
+def _grows(system: System, loop: Loop) -> bool:
+    """Whether a sampled loop lets the motion grow: poles of state and last reading, input held over each sample."""
+    M, D, K = matrices(system)
+    sensor, n = system.sensors[loop.sensor], len(M)
+    push = np.linalg.solve(M, joint(system, (GROUND, system.inputs[0].body)))
+    whole = np.zeros((2 * n + 1, 2 * n + 1))
+    whole[:n, n : 2 * n] = np.eye(n)
+    whole[n : 2 * n] = np.column_stack([-np.linalg.solve(M, K), -np.linalg.solve(M, D), push])
+    step = scipy.linalg.expm(whole * system.dt)
+    seen = np.zeros(2 * n)
+    seen[(sensor.kind == "velocity") * n + system.bodies.index(sensor.body)] = 1.0
+    rate = loop.rate_gain / system.dt
+    moved = step[: 2 * n, : 2 * n] - (loop.gain + rate) * np.outer(step[: 2 * n, -1], seen)
+    closed = np.block([[moved, rate * step[: 2 * n, -1:]], [seen[None], np.zeros((1, 1))]])
+    return bool(np.abs(np.linalg.eigvals(closed)).max() > 1 + NEUTRAL)
 
 
 def _setup(rng: np.random.Generator, case: Planned) -> _Setup:

@@ -16,6 +16,7 @@ SETS = {
     "third": 14_700_000,
     "fourth": 17_300_000,
     "fifth": 19_900_000,
+    "sixth": 22_700_000,
 }
 NOISES = ((0.01, 0.6), (0.001, 0.2), (0.05, 0.2))
 FAMILIES = {
@@ -25,6 +26,7 @@ FAMILIES = {
     "third": ("mass", "chain", "drive", "frame"),
     "fourth": ("mass", "chain", "drive", "frame"),
     "fifth": ("mass", "chain", "drive", "frame"),
+    "sixth": ("mass", "chain", "drive", "frame"),
 }
 # of a cycle's cases, by family in the order above: a mass says little about places
 TESTED = (0.15, 0.35, 0.2, 0.3)
@@ -35,6 +37,7 @@ SHARES = {
     "third": TESTED,
     "fourth": TESTED,
     "fifth": TESTED,
+    "sixth": TESTED,
 }
 ONE_SENSOR, COLOURED = 0.15, 0.2
 
