@@ -10,6 +10,7 @@ from excitation import drawn as signal_of
 from families import FAMILIES, deviating, sensors
 from laws import FORCES, INPUT, KINKED, OUTSIDE, SENSOR, UNLIKE
 from plan import SETS, Planned
+from plant import plant
 from severity import Severity, severity
 from sizes import ABSORBED, ANY, LIMITS, Scale, parameters, shape
 from systems import GROUND, Effect, System, frequencies, joint, matrices, spring
@@ -131,18 +132,14 @@ def _loop(rng: np.random.Generator, system: System) -> Loop | None:
 
 def _grows(system: System, loop: Loop) -> bool:
     """Whether a sampled loop lets the motion grow: poles of state and last reading, input held over each sample."""
-    M, D, K = matrices(system)
-    sensor, n = system.sensors[loop.sensor], len(M)
-    push = np.linalg.solve(M, joint(system, (GROUND, system.inputs[0].body)))
-    whole = np.zeros((2 * n + 1, 2 * n + 1))
-    whole[:n, n : 2 * n] = np.eye(n)
-    whole[n : 2 * n] = np.column_stack([-np.linalg.solve(M, K), -np.linalg.solve(M, D), push])
-    step = scipy.linalg.expm(whole * system.dt)
-    seen = np.zeros(2 * n)
-    seen[(sensor.kind == "velocity") * n + system.bodies.index(sensor.body)] = 1.0
+    linear = plant(system, (), 0.0)
+    n, seen = len(linear.A), linear.C[loop.sensor]
+    step = scipy.linalg.expm(
+        system.dt * np.pad(np.column_stack([linear.A, linear.B[:, 0]]), ((0, 1), (0, 0)))
+    )
     rate = loop.rate_gain / system.dt
-    moved = step[: 2 * n, : 2 * n] - (loop.gain + rate) * np.outer(step[: 2 * n, -1], seen)
-    closed = np.block([[moved, rate * step[: 2 * n, -1:]], [seen[None], np.zeros((1, 1))]])
+    moved = step[:n, :n] - (loop.gain + rate) * np.outer(step[:n, n], seen)
+    closed = np.block([[moved, rate * step[:n, n:]], [seen, 0.0]])
     return bool(np.abs(np.linalg.eigvals(closed)).max() > 1 + NEUTRAL)
 
 
