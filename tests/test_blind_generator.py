@@ -390,6 +390,19 @@ def test_only_exact_equivalences_count():
     assert not equivalent.same_place(labelled("random_force", {"body": "b2"}), 0, {"input": "u"})
 
 
+def test_what_is_said_of_an_answer_is_said_of_all_that_no_record_tells_from_it():
+    place, sensor = {"input": "u"}, {"sensor": "s0"}
+    at = [("input_delay", place, 0.5), ("sensor_delay", sensor, 0.4), ("sensor_lag", sensor, 0.05)]
+    ranked = [{"kind": k, "place": p, "probability": x} for k, p, x in at]
+    for sensors, said in (CHAIN.sensors[:1], 0.9), (CHAIN.sensors, 0.5):
+        # whatever is true
+        label = labelled("cubic_stiffness", {"between": ["b1", "b2"]}, sensors)
+        case = lambda of, label=label: score.Scored(label, {"effects": ranked, "selected": of}, 1.0)  # noqa: E731
+        assert score.said_of_first(case(ranked[:1])) == pytest.approx(said)
+        # beside another effect it matters on which side of it
+        assert score.said_of_first(case([ranked[0], *ranked[:1]])) == pytest.approx(0.5)
+
+
 def test_scores_of_a_few_answers():
     label = labelled("cubic_stiffness", {"between": ["b1", "b2"]})
     good = {"kind": "cubic_stiffness", "place": {"between": ["b2", "b1"]}, "probability": 0.9}

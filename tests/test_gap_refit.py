@@ -32,13 +32,13 @@ from jaxsid.gap.refit import (
     Refit,
     _with_own,
     as_guessed,
-    loudest,
     prior_of,
     refitted,
     shot_of,
     states_without,
     weighed_anew,
 )
+from jaxsid.gap.roughly import loudest
 from jaxsid.gap.setting import slowest_rate
 from jaxsid.gap.shooting import parameters_of, products_of
 from jaxsid.gap.windows import BLOCKS, LEAD, LONGEST, SHORTEST, blocks_of, untold, window_length

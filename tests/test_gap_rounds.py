@@ -6,24 +6,30 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from gap_helpers import chain, silent
+from gap_bench import bench, colored
+from gap_helpers import chain, drive, exact, silent
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
 
 from jaxsid.gap import explain, search
 from jaxsid.gap import look as look_of
 from jaxsid.gap import ranking as ranking_of
-from jaxsid.gap.explain import HERE, TEMPERATURE, _connections, _roughly, extended
+from jaxsid.gap import roughly as roughly_of
+from jaxsid.gap.explain import TEMPERATURE, _connections, extended
 from jaxsid.gap.look import Look
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import (
+    FEWER,
+    NEAR,
     STRAIGHT,
     Whole,
     key_of,
     ranked,
     still_due,
 )
-from jaxsid.gap.refit import Hypothesis
+from jaxsid.gap.refit import Hypothesis, in_windows, refitted
+from jaxsid.gap.roughly import ALIKE, HERE, SIZES, loudest, roughly
 from jaxsid.gap.search import Found, _otherwise
+from jaxsid.gap.windows import BLOCKS
 
 B13 = {"between": ("b1", "b3")}
 LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping"]
@@ -37,20 +43,22 @@ def tried(monkeypatch):
         fitted = []
 
         def fit(part, hypothesis, **_):
+            if not hypothesis.effects:
+                return refit(-1e7, squares=1e9)
             effect = hypothesis.effects[-1]
             key = effect.kind, effect.place[0][1]
             if key not in fitted:
                 fitted.append(key)
             return refit(evidences.get(key, -1e6), hypothesis=hypothesis)
 
-        monkeypatch.setattr(explain, "refitted", fit)
-        monkeypatch.setattr(explain, "changes_of", lambda found, bench: None)
-        monkeypatch.setattr(explain, "side_by_side", lambda f, xs: [f(x) for x in xs])
+        monkeypatch.setattr(roughly_of, "refitted", fit)
+        monkeypatch.setattr(roughly_of, "changes_of", lambda found, bench: None)
+        monkeypatch.setattr(roughly_of, "side_by_side", lambda f, xs: [f(x) for x in xs])
         monkeypatch.setattr(
             ranking_of, "sensible", lambda found, bench: found.hypothesis.effects[-1].kind not in senseless
         )
         every = [(c, extended(Hypothesis(), c, {}), None) for c in candidates]
-        return fitted, _roughly(BENCH, every, first, silent)
+        return fitted, roughly(BENCH, every, refit(-1e7), first, silent)
 
     return run
 
@@ -64,6 +72,55 @@ def test_further_laws_are_tried_where_the_best_one_acts(tried):
     here = [(k, ("b1", "b2")) for k in LAWS[1 : 1 + HERE]]
     assert fitted == [("backlash", ("b2", "b3")), ("stribeck_friction", ("b1", "b2")), *here]
     assert rough[0][0].kind == "stribeck_friction"
+
+
+def test_a_law_that_leaves_more_than_there_was_begins_anew_with_another_number(monkeypatch):
+    """From far off the search stays where it began."""
+    valley, started = 0.25, []
+
+    def fit(part, hypothesis, *, steps, **_):
+        if not hypothesis.effects:
+            return refit(-1.0, squares=1000.0)
+        (size,) = hypothesis.effects[-1].parameters.values()
+        started.append((float(size), steps))
+        squares = 900.0 if steps > 1 and size == valley else 1000.0 + abs(float(np.log(size / valley)))
+        return refit(-squares, squares, hypothesis=hypothesis)
+
+    for name, instead in {
+        "refitted": fit,
+        "changes_of": lambda found, bench: None,
+        "side_by_side": lambda f, xs: [f(x) for x in xs],
+        "value": lambda found, bench: found.fit.evidence,
+    }.items():
+        monkeypatch.setattr(roughly_of, name, instead)
+
+    def found(**parameters):
+        started.clear()
+        c = candidate("actuator_lag", {"input": "u"}, **parameters)
+        ((_, best),) = roughly(BENCH, [(c, extended(Hypothesis(), c, {}), None)], refit(-1.0), 1, silent)
+        return best.fit.squares
+
+    assert found(time_constant=1.0) == 900.0
+    assert [x for x, steps in started if steps == 1] == [k * 1.0 for k in SIZES]
+    assert found(time_constant=0.25) == 900.0  # it need not
+    assert len([x for x, steps in started if steps == 1]) == 0
+
+
+def test_of_blocks_that_are_missed_as_much_the_one_of_the_largest_signal_counts():
+    half = BLOCKS[-1]
+    u = drive(2 * half)
+    u[half:] *= 5.0
+    y, level = colored(exact(u), 0)
+    y[: half // 2] += 0.4 * level * (-1.0) ** np.arange(half // 2)[:, None]
+    of = bench(y, level, u=u)
+    assert len(of.blocks) == 2
+    found = refitted(of, Hypothesis())
+    size = [
+        float((np.asarray(x.left) ** 2 * np.asarray(b.weight)).sum())
+        for b, x in zip(of.blocks, in_windows(of, found), strict=True)
+    ]
+    assert ALIKE < size[1] / size[0] < 1.0
+    assert loudest(of, found).blocks[0] is of.blocks[1]
 
 
 def test_springs_are_tried_wherever_a_law_acts(tried):
@@ -135,6 +192,28 @@ def test_springs_are_fitted_thoroughly_beside_a_law_that_is_not(best, values, du
     assert still_due(rough, values, {}, 40.0) == [int(np.argmax(values))]
 
 
+def test_laws_of_fewer_numbers_are_fitted_thoroughly_where_a_richer_one_is_best():
+    near, far = 1000.0 * NEAR**2 * 0.9, 1000.0 * NEAR**2 * 1.1  # squares next to those of the best one
+    laws = [
+        ("end_stop", B12, 1000.0),
+        ("cubic_stiffness", B23, near),
+        ("missing_connection", B12, near),
+        ("quadratic_stiffness", B12, far),
+        ("constant_load", {"body": "b2"}, near),
+        ("backlash", B12, near),
+        ("cubic_stiffness", {"between": ("b2", "b1")}, near),
+        ("bilinear_stiffness", B12, near),
+    ]
+    assert FEWER == 2
+    rough = [(candidate(k, p), refit(-1e6 * i, squares)) for i, (k, p, squares) in enumerate(laws)]
+    values, whole = [-1e6 * i for i in range(len(laws))], Whole(BENCH, refit(0.0))
+    assert still_due(rough, values, {0: whole}, 40.0) == [5, 6]
+    assert still_due(rough, values, {0: whole, 5: whole}, 40.0) == [6]
+    assert still_due(rough, values, {0: whole, 5: whole, 6: whole}, 40.0) == []
+    # one number has none within it
+    assert still_due(rough, [*values[:5], 1.0, *values[6:]], {5: whole}, 40.0) == []
+
+
 @pytest.mark.parametrize(("body", "due"), [("b2", [1]), ("b3", [])])
 def test_a_periodic_force_is_fitted_thoroughly_in_the_place_of_a_part_that_swings(body, due):
     kinds = [("missing_mode", {"body": "b2"}), ("periodic_disturbance", {"body": body})]
@@ -170,7 +249,7 @@ def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypa
 
     patches = {
         "loudest": lambda bench, without: bench,
-        "_roughly": lambda part, every, tried, say: [
+        "roughly": lambda part, every, without, tried, say: [
             (c, refit(-10.0 * i)) for i, (c, *_) in enumerate(every)
         ],
         "_whole": whole,

@@ -55,16 +55,31 @@ def right_answers(label: dict[str, Any], number: int) -> set[Answer]:
     """
     effect = label["effects"][number]
     own = {answer(kind, effect["place"]) for kind in effect["kinds_right"]}
-    system = system_of(label["true"])
-    kind = effect["kind"]
-    if label["one_sensor"] and len(label["effects"]) == 1:
-        own |= _in_series(kind, system)
+    return own | _not_told(label, effect["kind"], own, alone=len(label["effects"]) == 1)
+
+
+def as_good(label: dict[str, Any], said: list[dict[str, Any]], first: dict[str, Any]) -> set[Answer]:
+    """An answer with all that no record tells from it, whatever is true.
+
+    Args:
+        label: of the case, for its system and sensors alone.
+        said: effects that were named together.
+        first: the answer.
+    """
+    own = {answer(first["kind"], first["place"])}
+    return own | _not_told(label, first["kind"], own, alone=len(said) <= 1)
+
+
+def _not_told(label: dict[str, Any], kind: str, own: set[Answer], *, alone: bool) -> set[Answer]:
+    system, found = system_of(label["true"]), set()
+    if label["one_sensor"] and alone:
+        found |= _in_series(kind, system)
     if label["one_sensor"] and kind == "periodic_disturbance":
         # a sinusoid on any body is one at the sensor, of free amplitude and phase
-        own |= {answer(kind, {"body": b}) for b in system.bodies}
+        found |= {answer(kind, {"body": b}) for b in system.bodies}
     if kind in ("constant_load", "sensor_bias"):
-        own |= _same_offsets(own, system)
-    return own
+        found |= _same_offsets(own, system)
+    return found
 
 
 def _in_series(kind: str, system: System) -> set[Answer]:

@@ -18,7 +18,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from deviations import pulls, within
-from equivalent import answer, right_answers, same_place
+from equivalent import answer, as_good, right_answers, same_place
 from generate import written
 
 LEAST = 0.3  # gap in noise from which on a case counts
@@ -96,6 +96,12 @@ def first_is_right(case: Scored) -> bool:
     return any(among(case, i, 1) for i in range(len(case.label["effects"])))
 
 
+def said_of_first(case: Scored) -> float:
+    """Probability of the first effect, with that of all that no record tells from it: any of them counts as right."""
+    good = as_good(case.label, case.found.get("selected") or [], case.ranked[0])
+    return min(sum(e["probability"] for e in case.ranked if answer(e["kind"], e["place"]) in good), 1.0)
+
+
 def first_set(case: Scored) -> list[dict[str, Any]]:
     """The most probable place, with those that it is not told apart from."""
     first = (case.found.get("locations") or [])[:1]
@@ -149,11 +155,7 @@ def calibration(rows: list[Scored]) -> dict[str, Any]:
     Args:
         rows: cases; where there is no effect of the catalogue any first one is wrong.
     """
-    pairs = [
-        (c.ranked[0]["probability"], first_is_right(c))
-        for c in rows
-        if c.ranked and "probability" in c.ranked[0]
-    ]
+    pairs = [(said_of_first(c), first_is_right(c)) for c in rows if c.ranked and "probability" in c.ranked[0]]
     bins = []
     for i in range(BINS):
         inside = [(p, ok) for p, ok in pairs if min(int(p * BINS), BINS - 1) == i]

@@ -8,7 +8,6 @@ best one leaves.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +31,6 @@ from jaxsid.gap.ranking import (
     parsimonious,
     ranked,
     still_due,
-    straight,
     value,
     volume,
 )
@@ -42,12 +40,12 @@ from jaxsid.gap.refit import (
     Refit,
     as_guessed,
     changes_of,
-    loudest,
     refitted,
     resolved,
     tied,
     weighed_anew,
 )
+from jaxsid.gap.roughly import FINE, label, loudest, roughly, start_from
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.parallel import side_by_side
@@ -55,14 +53,9 @@ from jaxsid.physical.elements import Element, element_matrices
 
 TEMPERATURE = 5.0  # of effects: what no law has decides more than noise
 MILD = 2.0  # of the model's numbers, whose equations are known
-ROUGH_STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
-LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
-HERE = 3  # other laws that are tried where the best rough one acts, beside springs and dampers
 ELSEWHERE = 3  # other places that the best law is fitted thoroughly at, where it leaves more than noise
 PLAINER = 2  # laws of fewer numbers that are tried where the best one acts and leaves more than noise
-HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
-FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 MORE = 3  # further ones that are fitted thoroughly as those before them turn out worse than they seemed
 SPRING = "missing_connection"
 
@@ -225,7 +218,7 @@ def elsewhere(
     bench = ranking.bench._replace(jump=ranking.bench.loose)
 
     def thorough(c: Candidate) -> Whole:
-        say(f"{c.kind} at {_label(c.place)}, thoroughly")
+        say(f"{c.kind} at {label(c.place)}, thoroughly")
         return _whole(
             bench, extended(base, c, errors), {"changes": _changes(before, bench, c.changes)}, effort
         )
@@ -240,7 +233,7 @@ def elsewhere(
     every = [(c, w.refit, density(*w) - volume(at), left_in(at, w)) for c, w in new.values()]
     shift, louder = volume(ranking.bench) - volume(at), math.exp(gauge(at) - gauge(ranking.bench))
     every += [(y, y.refit, y.evidence + shift, y.left * louder) for y in ranking.ranked if y.key not in new]
-    without = refitted(at, ranking.without.hypothesis, **_from(ranking.without, bench))
+    without = refitted(at, ranking.without.hypothesis, **start_from(ranking.without, bench))
     return ranked(every, without, at, effort.temperature)
 
 
@@ -271,7 +264,7 @@ def plainer(
     ][:PLAINER]
 
     def thorough(y: Explanation) -> Whole:
-        say(f"{y.kind} at {_label(y.place)}, thoroughly")
+        say(f"{y.kind} at {label(y.place)}, thoroughly")
         return _whole(bench, y.refit.hypothesis, {"changes": _changes(before, bench)}, effort)
 
     due = [y for y in fewer if len(y.refit.fit.states) != whole]
@@ -318,7 +311,7 @@ def _round(
 ) -> Ranking:
     """Candidates fitted to a part of the records, the best of them to all, and compared."""
     part = loudest(bench, without)
-    rough = _roughly(part, every, effort.tried, say)
+    rough = roughly(part, every, without, effort.tried, say)
     first, done, scale = 0, {}, min((r.fit.squares / r.fit.equations for _, r in rough), default=1.0)
     if known is not None:
         first = next(i for i, (c, _) in enumerate(rough) if c is known.candidate)
@@ -328,7 +321,7 @@ def _round(
 
     def thorough(i: int) -> Whole:
         c, r = rough[i]
-        say(f"{c.kind} at {_label(c.place)}, thoroughly")
+        say(f"{c.kind} at {label(c.place)}, thoroughly")
         changes = changes_of(r, bench) if known is None else known.begin
         return _whole(bench, r.hypothesis, {"changes": changes}, effort)
 
@@ -347,46 +340,6 @@ def _round(
     return nested(_compared(rough, values, done, bench, without, effort), effort.steps, say)
 
 
-def _roughly(
-    part: Bench,
-    every: Sequence[tuple[Candidate, Hypothesis, Any]],
-    tried: int,
-    say: Callable[[str], None],
-) -> list[tuple[Candidate, Refit]]:
-    """Candidates fitted to a part of the records, best first: some steps for each, more for the best.
-
-    The first ones, and further laws of the place where one of them fits best, even if it makes no sense there.
-    """
-
-    def begun(one: tuple[Candidate, Hypothesis, Any]) -> tuple[Candidate, Refit]:
-        c, hypothesis, changes = one
-        say(f"{c.kind} at {_label(c.place)}")
-        steps = ROUGH_STEPS + STEPS_A_NUMBER * len(c.parameters)
-        return c, refitted(part, hypothesis, changes=changes, steps=steps, gain=FINE)
-
-    rough = side_by_side(begun, every[:tried])
-    best = max(rough, key=lambda x: x[1].fit.evidence)[0].place if rough else {}
-    here = [x for x in every[tried:] if ends_of(x[0].place) == ends_of(best)] if best else []
-    # a stop without play, or a stiffening spring that hardly stiffens, is a spring
-    bent = [x for x in here if not straight(x[0].kind)]
-    rough += side_by_side(begun, [x for x in here if straight(x[0].kind)] + bent[:HERE])
-    for few, more in LONGER:
-        rough.sort(key=lambda x: -value(x[1], part))
-        most = HOPELESS * rough[0][1].fit.squares if rough else 0.0
-        top = key_of("", rough[0][0].place) if rough else None
-        here = [i for i, (c, _) in enumerate(rough) if key_of("", c.place) == top]
-        hopeful = [i for i, (_, r) in enumerate(rough[:few]) if r.fit.squares < most]
-        due = [i for i in sorted({*hopeful, *here}) if not rough[i][1].fit.settled]
-        on = partial(_longer, part=part, steps=more)
-        for i, r in zip(due, side_by_side(on, [rough[i][1] for i in due]), strict=True):
-            rough[i] = rough[i][0], r
-    return sorted(rough, key=lambda x: -value(x[1], part))
-
-
-def _longer(found: Refit, *, part: Bench, steps: int) -> Refit:
-    return refitted(part, found.hypothesis, **_from(found, part), steps=steps, gain=FINE)
-
-
 def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: Effort) -> Whole:
     """A hypothesis with the noise that it leaves, where nothing else tells of it, and windows tied if that suits it.
 
@@ -398,17 +351,12 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
         return Whole(bench, found)
     bench, found = tied(bench, found, **linked)
     if (finer := resolved(bench, found)) is not bench:
-        bench, found = finer, refitted(finer, found.hypothesis, **_from(found, finer), **search)
+        bench, found = finer, refitted(finer, found.hypothesis, **start_from(found, finer), **search)
     if any(n.degrees <= 0 for n in bench.noises):
         bench = weighed_anew(bench, found)
-        found = refitted(bench, found.hypothesis, **_from(found, bench), **search)
+        found = refitted(bench, found.hypothesis, **start_from(found, bench), **search)
         bench, found = tied(bench, found, **linked)
     return Whole(bench, found)
-
-
-def _from(found: Refit, bench: Bench) -> dict[str, Any]:
-    """Where a further fit begins."""
-    return {"changes": changes_of(found, bench), "states": found.fit.states}
 
 
 def _values(
@@ -441,7 +389,7 @@ def _compared(
     if not rough:
         return ranked([], without, bench, effort.temperature)
     at = done.get(int(np.argmax(values)), Whole(bench, rough[0][1]))
-    without = refitted(at.bench, without.hypothesis, **_from(without, bench))
+    without = refitted(at.bench, without.hypothesis, **start_from(without, bench))
     every = []
     for i, ((c, r), x) in enumerate(zip(rough, values, strict=True)):
         own = done.get(i, Whole(bench, r))
@@ -488,8 +436,3 @@ def extended(base: Hypothesis, c: Candidate, errors: Mapping[Key, tuple[int, ...
         return base._replace(wrong=tuple(sorted({*base.wrong, *rows})))
     effect = Effect(c.kind, tuple(c.place.items()), dict(c.parameters))
     return base._replace(effects=(*base.effects, effect))
-
-
-def _label(place: Mapping[str, Any]) -> str:
-    ((_, ends),) = place.items()
-    return " - ".join(ends) if isinstance(ends, tuple | list) else str(ends)

@@ -22,6 +22,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e8
 EASED = 1e3  # factor by which damping falls where it held a step back
 IDLE = 2  # steps in a row that bring little, after which no more is expected
 SLOWER = 2.0  # factor of damping after a step that failed, doubled with each more
+NEEDLESS = 8  # most evaluations that are not counted
 NONE = slice(0, 0)
 HALVINGS = 5  # of a law that lets the motion grow, towards what is likely beforehand, to begin with
 MORE = 1.3  # mean square in noise from which on more is left than noise, so that deviations must come from windows
@@ -91,20 +92,21 @@ def fitted(
         theta: (p,) to begin with.
         states: likewise, of each block.
         substeps: steps for each sampling interval.
-        steps: most evaluations.
+        steps: most evaluations; not counted are the first ones that only tell how much damping a step needs.
         gain: of the cost, in mean squares of what is left, that is not worth a step.
         eased: unknowns that begin nearer to their prior's mean where the motion grows without bound.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
     at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
     damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
+    free, moved = 0, False
     for _ in range(HALVINGS):
         if np.isfinite(at.cost) or not np.any(theta[eased]):
             break
         theta = theta.copy()
         theta[eased] = np.maximum((theta[eased] + prior.mean[eased]) / 2, prior.least[eased])
         at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
-    while done < steps and np.isfinite(at.cost):
+    while done - free < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, links, damping)
         new = np.maximum(at.theta + move, prior.least)
         found = _evaluated(
@@ -120,6 +122,7 @@ def fitted(
         less = at.cost - found.cost
         if less > 0:
             # what has just failed with less damping would fail again
+            moved = True
             at, damping = found, damping if growth > SLOWER else max(damping / 5, LEAST_DAMPING)
             growth = SLOWER
             little = gain * max(1.0, found.squares / max(found.equations, 1)) + PART * abs(found.cost)
@@ -135,6 +138,7 @@ def fitted(
                     damping = max(damping / EASED, LEAST_DAMPING)
         else:
             damping, growth = damping * growth, SLOWER * growth
+            free += not moved and free < NEEDLESS
             if damping > MOST_DAMPING:
                 settled = True
                 break

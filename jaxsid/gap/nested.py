@@ -11,6 +11,8 @@ import numpy as np
 
 from jaxsid.gap.hypothesis import with_parameters
 from jaxsid.gap.ranking import (
+    FEWER,
+    NEAR,
     Explanation,
     Ranking,
     Whole,
@@ -24,8 +26,6 @@ from jaxsid.gap.ranking import (
 from jaxsid.gap.refit import Hypothesis, Refit, changes_of, refitted, states_without
 from jaxsid.parallel import side_by_side
 
-FEWER = 2  # that are tried
-NEAR = 4.0  # times what the best one leaves, from which on none is
 PARTS = 1.0, 0.5, 0.25, 0.125, 0.0625  # of its number that one begins with
 GAIN = 2.0  # of the search, below which it has come to an end
 

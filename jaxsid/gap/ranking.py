@@ -19,6 +19,8 @@ CLOSE = 40.0  # tempered difference of rough evidence beyond which a candidate i
 LOUD = 2.0  # rms in noise from which on what is left is none, whatever share of it tests find
 PIECES = 20.0  # independent ones that what is left counts as, where it is no noise
 NUMBER = 3.0  # log odds against each number of a law there
+FEWER = 2  # laws of fewer numbers that are tried thoroughly where the best one acts
+NEAR = 4.0  # times what the best one leaves, from which on none is
 TOLD = 3.0  # deviations from zero from which on a number is known; right ones of the second test set have 11
 # kinds that are a wrong number of the model
 ERRORS = {"mass": "mass_error", "damping": "damping_error", "stiffness": "stiffness_error"}
@@ -234,7 +236,8 @@ def still_due(
     """What must still be fitted thoroughly: the best one, then what it may stand for.
 
     Springs and dampers where it acts, or nearly as good; a periodic force in the place of a part that swings, whose
-    own motion, free in every window, is one.
+    own motion, free in every window, is one; other laws of fewer numbers where it acts, since a richer one, as a stop
+    beside a spring that may be softer is for play, comes close from further away.
 
     Args:
         rough: candidates, fitted to a part of the records.
@@ -254,8 +257,24 @@ def still_due(
     here = {i for i, c in left if ends_of(c.place) == ends_of(at.place)}
     swings = CATALOGUE[at.kind].vibrates is not None
     due = [i for i, c in left if swings and i in here and c.kind == RINGING]
+    due += _simpler(rough, best, done)
     reach = {i: near if i in here else STRAIGHT / CLOSE * near for i, c in left if straight(c.kind)}
     return due + [i for i in reach if top - values[i] < reach[i]]
+
+
+def _simpler(rough: Sequence[tuple[Candidate, Refit]], best: int, done: Mapping[int, Whole]) -> list[int]:
+    """The first laws of fewer numbers where the best one acts that do not leave far more, but those that are done."""
+    at, squares = rough[best][0], rough[best][1].fit.squares
+    fewer = [
+        i
+        for i, (c, r) in enumerate(rough)
+        if ends_of(c.place) == ends_of(at.place)
+        and CATALOGUE[c.kind].where == CATALOGUE[at.kind].where
+        and not straight(c.kind)
+        and numbers_of(c.kind) < numbers_of(at.kind)
+        and r.fit.squares < NEAR**2 * squares
+    ]
+    return [i for i in fewer[:FEWER] if i not in done]
 
 
 def numbers_of(kind: str) -> int:

@@ -336,19 +336,6 @@ def _in_noise(bench: Bench, found: Refit) -> Float[np.ndarray, " values"]:
     return np.concatenate([np.zeros(0), *each])
 
 
-def loudest(bench: Bench, found: Refit) -> Bench:
-    """The one block of which a fit leaves most, in noise: what the fit lacks is at work there.
-
-    Args:
-        bench: that it was fitted to.
-        found: the fit.
-    """
-    parts = zip(bench.blocks, in_windows(bench, found), strict=True)
-    left = [float(((np.asarray(x.left) * np.asarray(b.weight))[:, b.lead :] ** 2).sum()) for b, x in parts]
-    i = int(np.argmax(left))
-    return bench._replace(blocks=(bench.blocks[i],), states=(bench.states[i],))
-
-
 def states_without(found: Refit, row: int) -> tuple[Float[np.ndarray, "windows n"], ...]:
     """States of every block of a fit, without those of one effect.
 

@@ -1,0 +1,137 @@
+"""Candidates fitted to a part of the records: which of them deserve a fit to all, and where that begins."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jaxsid.gap.hypothesis import with_parameters
+from jaxsid.gap.ranking import ends_of, key_of, straight, value
+from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
+from jaxsid.gap.screen import Candidate
+from jaxsid.parallel import side_by_side
+
+STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
+FEW = 10  # steps of a fit to one block alone
+ALIKE = 0.8  # part of the most that a block leaves, from which on another leaves as much
+LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
+HERE = 3  # other laws that are tried where the best one acts, beside springs and dampers
+HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
+FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
+# times its number that a law begins with, where the one given leads to more than there is without it
+SIZES = 2.0, 1.4, 0.7, 0.5, 0.25, 0.125
+
+
+def loudest(bench: Bench, found: Refit) -> Bench:
+    """The one block of which a fit leaves most, in noise, once it is fitted to that alone: what it lacks is there.
+
+    Fitted to all it may leave most where nothing is the matter, its numbers being those that suit the others. Where
+    several leave nearly as much that may be chance, and laws show where signals are large.
+
+    Args:
+        bench: that it was fitted to.
+        found: the fit.
+    """
+
+    def left_alone(part: Bench) -> float:
+        begin = {"changes": changes_of(found, part), "steps": FEW, "gain": FINE}
+        return refitted(part, found.hypothesis, **begin).fit.squares
+
+    each = zip(bench.blocks, bench.states, strict=True)
+    parts = [bench._replace(blocks=(b,), states=(x,)) for b, x in each]
+    left = np.array(side_by_side(left_alone, parts))
+    signal = [((np.asarray(b.y) * np.asarray(b.weight))[:, b.lead :] ** 2).sum() for b in bench.blocks]
+    return parts[int(np.argmax(np.where(left >= ALIKE * left.max(), signal, -1.0)))]
+
+
+def roughly(
+    part: Bench,
+    every: Sequence[tuple[Candidate, Hypothesis, Any]],
+    without: Refit,
+    tried: int,
+    say: Callable[[str], None],
+) -> list[tuple[Candidate, Refit]]:
+    """Candidates fitted to a part of the records, best first: some steps for each, more for the best.
+
+    The first ones, and further laws of the place where one of them fits best, even if it makes no sense there.
+
+    Args:
+        part: of the records.
+        every: candidates, most promising first, their hypotheses, and the changes of elements to begin with.
+        without: the fit to all records without any of them.
+        tried: how many of the first ones.
+        say: called with a line of text before each fit.
+    """
+    begin = {"changes": changes_of(without, part), "steps": 1}
+    nothing = refitted(part, without.hypothesis, **begin).fit.squares
+
+    def begun(one: tuple[Candidate, Hypothesis, Any]) -> tuple[Candidate, Refit]:
+        c, hypothesis, changes = one
+        say(f"{c.kind} at {label(c.place)}")
+        steps = STEPS + STEPS_A_NUMBER * len(c.parameters)
+        search = {"changes": changes, "steps": steps, "gain": FINE}
+        found = refitted(part, hypothesis, **search)
+        if found.fit.squares <= nothing or not math.isfinite(nothing):
+            return c, found
+        # screened on a motion that is not its own; from far off the search ends in another valley
+        sizes = [refitted(part, h, changes=changes, steps=1) for h in _of_sizes(hypothesis, c)]
+        first = max(sizes, key=lambda x: value(x, part), default=found)
+        again = refitted(part, first.hypothesis, **search) if sizes else found
+        return c, again if again.fit.squares < found.fit.squares else found
+
+    rough = side_by_side(begun, every[:tried])
+    best = max(rough, key=lambda x: x[1].fit.evidence)[0].place if rough else {}
+    here = [x for x in every[tried:] if ends_of(x[0].place) == ends_of(best)] if best else []
+    # a stop without play, or a stiffening spring that hardly stiffens, is a spring
+    bent = [x for x in here if not straight(x[0].kind)]
+    rough += side_by_side(begun, [x for x in here if straight(x[0].kind)] + bent[:HERE])
+    for few, more in LONGER:
+        rough.sort(key=lambda x: -value(x[1], part))
+        most = HOPELESS * rough[0][1].fit.squares if rough else 0.0
+        top = key_of("", rough[0][0].place) if rough else None
+        here = [i for i, (c, _) in enumerate(rough) if key_of("", c.place) == top]
+        hopeful = [i for i, (_, r) in enumerate(rough[:few]) if r.fit.squares < most]
+        due = [i for i in sorted({*hopeful, *here}) if not rough[i][1].fit.settled]
+        on = partial(_longer, part=part, steps=more)
+        for i, r in zip(due, side_by_side(on, [rough[i][1] for i in due]), strict=True):
+            rough[i] = rough[i][0], r
+    return sorted(rough, key=lambda x: -value(x[1], part))
+
+
+def start_from(found: Refit, bench: Bench) -> dict[str, Any]:
+    """Where a further fit begins.
+
+    Args:
+        found: a fit.
+        bench: that the further one is of.
+    """
+    return {"changes": changes_of(found, bench), "states": found.fit.states}
+
+
+def label(place: Mapping[str, Any]) -> str:
+    """A place in a word or two.
+
+    Args:
+        place: as of an `Effect`.
+    """
+    ((_, ends),) = place.items()
+    return " - ".join(ends) if isinstance(ends, tuple | list) else str(ends)
+
+
+def _of_sizes(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
+    """The hypothesis with multiples of the number of its last effect, if that is the candidate and has but one."""
+    effect = of.effects[-1] if of.effects else None
+    if (
+        effect is None
+        or len(effect.parameters) != 1
+        or key_of(effect.kind, dict(effect.place)) != key_of(c.kind, c.place)
+    ):
+        return []
+    parts = [{n: k * np.asarray(v) for n, v in effect.parameters.items()} for k in SIZES]
+    return [of._replace(effects=(*of.effects[:-1], with_parameters(effect, x))) for x in parts]
+
+
+def _longer(found: Refit, *, part: Bench, steps: int) -> Refit:
+    return refitted(part, found.hypothesis, **start_from(found, part), steps=steps, gain=FINE)
