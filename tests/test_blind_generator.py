@@ -392,8 +392,9 @@ def test_only_exact_equivalences_count():
 
 def test_what_is_said_of_an_answer_is_said_of_all_that_no_record_tells_from_it():
     place, sensor = {"input": "u"}, {"sensor": "s0"}
-    at = [("input_delay", place, 0.5), ("sensor_delay", sensor, 0.4), ("sensor_lag", sensor, 0.05)]
-    ranked = [{"kind": k, "place": p, "probability": x} for k, p, x in at]
+    at = [("input_delay", place, 0.5, 1), ("sensor_delay", sensor, 0.4, 1), ("sensor_lag", sensor, 0.05, 1)]
+    at.append(("sensor_delay", sensor, 0.04, 2))  # a second effect is another answer
+    ranked = [{"kind": k, "place": p, "probability": x, "round": i} for k, p, x, i in at]
     for sensors, said in (CHAIN.sensors[:1], 0.9), (CHAIN.sensors, 0.5):
         # whatever is true
         label = labelled("cubic_stiffness", {"between": ["b1", "b2"]}, sensors)

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from generate import written
 
 WHOLE = ("verdict", "verdict_probability", "finding", "selected", "closure")
-EFFECT = ("kind", "place", "probability")
+EFFECT = ("kind", "place", "probability", "round")
 LOCATION = ("together", "probability")
 FIRST = 10  # of effects and places
 ABOVE = re.compile(r'File "[^"]*/(?=(jaxsid|benchmarks|site-packages)/)')  # folders of one machine

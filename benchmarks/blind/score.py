@@ -98,8 +98,10 @@ def first_is_right(case: Scored) -> bool:
 
 def said_of_first(case: Scored) -> float:
     """Probability of the first effect, with that of all that no record tells from it: any of them counts as right."""
-    good = as_good(case.label, case.found.get("selected") or [], case.ranked[0])
-    return min(sum(e["probability"] for e in case.ranked if answer(e["kind"], e["place"]) in good), 1.0)
+    first = case.ranked[0]
+    good = as_good(case.label, case.found.get("selected") or [], first)
+    same = [e for e in case.ranked if e.get("round") == first.get("round")]
+    return sum(e["probability"] for e in same if answer(e["kind"], e["place"]) in good)
 
 
 def first_set(case: Scored) -> list[dict[str, Any]]:
