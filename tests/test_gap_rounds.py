@@ -32,7 +32,8 @@ from jaxsid.gap.search import Found, _otherwise
 from jaxsid.gap.windows import BLOCKS
 
 B13 = {"between": ("b1", "b3")}
-LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping"]
+LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping", "quadratic_stiffness"]
+LAWS += ["bilinear_stiffness", "time_varying_stiffness"]
 
 
 @pytest.fixture

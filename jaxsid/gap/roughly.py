@@ -17,7 +17,7 @@ STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
 FEW = 10  # steps of a fit to one block alone
 ALIKE = 0.8  # part of the most that a block leaves, from which on another leaves as much
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
-HERE = 3  # other laws that are tried where the best one acts, beside springs and dampers
+HERE = 6  # other laws that are tried where the best one acts, beside springs and dampers
 HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 # times its number that a law begins with, where the one given leads to more than there is without it
