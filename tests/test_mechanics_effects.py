@@ -384,3 +384,14 @@ def test_a_loop_makes_sense_where_its_memory_saturates(beta, gamma, exponent, sa
         assert path.y[0, -1] > 100
     assert kind.sensible(1.0, beta, gamma, exponent) == saturates
     assert not kind.sensible(-1.0, beta, gamma, exponent)
+
+
+@pytest.mark.parametrize(
+    ("damping", "swings"), [(0.0, True), (0.9, True), (1.9, True), (2.1, False), (9.0, False)]
+)
+def test_a_part_makes_sense_as_a_mode_where_it_swings(damping, swings):
+    """By its poles: m s^2 + c s + k with m = 0.5, k = 2."""
+    poles = np.roots([0.5, damping, 2.0])
+    assert (np.abs(poles.imag) > 0).all() == swings
+    assert CATALOGUE["missing_mode"].sensible(0.5, 2.0, damping) == swings
+    assert not CATALOGUE["missing_mode"].sensible(0.5, 0.0, damping)

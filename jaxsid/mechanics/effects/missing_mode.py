@@ -16,6 +16,11 @@ def _vibrates(mass: float, stiffness: float, damping: float) -> float:
     return math.sqrt(stiffness / mass) if mass > 0 else math.inf
 
 
+def _sensible(mass: float, stiffness: float, damping: float) -> bool:
+    # a part that creeps back adds no resonance, and stands for losses of another law
+    return damping < 2 * math.sqrt(max(stiffness * mass, 0.0))
+
+
 EFFECT = Kind(
     name="missing_mode",
     where="body",
@@ -29,5 +34,6 @@ EFFECT = Kind(
     source="J. P. Den Hartog, Mechanical Vibrations, 4th ed., 1956, ch. 3.",
     changes=_changes,
     states=2,
+    sensible=_sensible,
     vibrates=_vibrates,
 )
