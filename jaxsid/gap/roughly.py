@@ -79,7 +79,7 @@ def roughly(
         sizes = [refitted(part, h, changes=changes, steps=1) for h in _of_sizes(hypothesis, c)]
         first = max(sizes, key=lambda x: value(x, part), default=found)
         again = refitted(part, first.hypothesis, **search) if sizes else found
-        return c, again if again.fit.squares < found.fit.squares else found
+        return c, max(found, again, key=lambda x: x.fit.evidence)
 
     rough = side_by_side(begun, every[:tried])
     best = max(rough, key=lambda x: x[1].fit.evidence)[0].place if rough else {}
