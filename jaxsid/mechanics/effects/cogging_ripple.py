@@ -6,7 +6,7 @@ from jaxtyping import Array
 from jaxsid.mechanics.effects.kind import FORCE, Kind, Motion, Parameter
 from jaxsid.mechanics.effects.prior import ANGLE, PART, Scale, size
 
-LEAST = 0.5  # of the angle's rms: what goes through less than a quarter of a turn is a load and a spring
+LEAST = 1.0  # of the angle's rms: what goes through less than half a turn is a load and a spring
 
 
 def _force(at: Motion, amplitude: Array, wavenumber: Array, phase: Array) -> Array:
