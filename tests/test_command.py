@@ -174,6 +174,7 @@ def test_quiet_says_nothing(files):
     assert identified(out)["order"] == 6
 
 
+@pytest.mark.slow
 def test_fewer_sensors_than_bodies_still_identify_with_a_warning(files, columns):
     model, _, out = files
     record = write_csv(out.parent / "two.csv", {n: x for n, x in columns.items() if n != "s3"})

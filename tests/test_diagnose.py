@@ -208,6 +208,7 @@ def test_numbers_are_named_that_are_beyond_their_tolerance_farthest_first(change
     assert {x["kind"] for x in named} == {"mass_error"}
 
 
+@pytest.mark.slow
 def test_a_spring_that_the_model_lacks_is_not_taken_for_wrong_numbers():
     """One sensor, whose readings the model's own numbers would give, several of them off by more than they may be."""
     u, lone = drive(), ((0, "acceleration"),)

@@ -80,6 +80,7 @@ def test_windows_are_short_and_lead_to_one_another(snaps):
         np.testing.assert_array_equal(states[there], motion[first[there]])
 
 
+@pytest.mark.slow
 def test_a_law_with_several_wells_is_found_where_usual_windows_are_too_long(snaps, fitted):
     _, _, usual, bench = snaps
     (effect,) = fitted.hypothesis.effects
@@ -128,6 +129,7 @@ def test_play_goes_where_the_law_is_right(snaps, fitted):
     assert tightened(usual, plain) == (usual, plain)
 
 
+@pytest.mark.slow
 def test_held_out_samples_are_followed_as_closely(snaps, fitted):
     whole, found, usual, bench = snaps
     assert motions_to_begin(usual, [whole], found.noises, found.scored) is None

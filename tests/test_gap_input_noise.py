@@ -50,7 +50,8 @@ def test_its_share_is_that_of_the_response_to_it():
     assert input_noise(setting, linear).share == pytest.approx(share, rel=0.1)
 
 
-@pytest.mark.parametrize("own", [pytest.param(0.01, marks=pytest.mark.slow), 0.001])
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [0.01, 0.001])
 def test_nothing_is_common_without_it(own):
     """Also where sensors are far quieter than the input: then the fit must ask for it too."""
     before, after = [], []
@@ -130,6 +131,7 @@ def test_its_resonances_are_no_lone_frequency(one):
     assert min(after) > 0.01
 
 
+@pytest.mark.slow
 def test_more_than_a_sensor_of_inputs_has_is_a_gap():
     found = examine(chain(), [measured(3 * LARGEST)])
     assert found.finding == "structure"
@@ -207,6 +209,7 @@ def test_periods_of_a_measured_input_tell_its_noise_with_one_sensor():
     assert found.noises[0].rms()[1] > 1.5 * quiet.noises[0].rms()[1]
 
 
+@pytest.mark.slow
 def test_the_rig_agrees_with_its_own_numbers_though_its_torque_is_measured_with_noise():
     torque = drive(4096, 7) / 10 * 3
     found = examine(rig(), [rig_record(1, demand=torque, torque_noise=0.01)])

@@ -90,7 +90,7 @@ def test_place_is_found_with_one_sensor():
     assert any("One sensor" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("part", [0.2, 0.5])
+@pytest.mark.parametrize("part", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
 def test_an_input_late_by_part_of_a_sample_is_no_late_accelerometer(part):
     """A held input is read a whole step late by an accelerometer where it acts, however little it is late."""
     kinds = [(0, "acceleration")]

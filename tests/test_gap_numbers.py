@@ -50,6 +50,7 @@ def test_signs_and_absent_numbers_are_left_alone():
     assert off_numbers(odd) == (1.0, ())
 
 
+@pytest.mark.slow
 def test_a_record_in_raw_units_says_that_a_gain_does_the_same():
     """A spring is half as stiff as the model has it, and the force 1.6 times smaller than the record says."""
     u = drive()

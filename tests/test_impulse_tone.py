@@ -24,7 +24,9 @@ DT = 1e-3
 TONE = np.sin(2 * np.pi * DT * np.arange(4096))
 
 
-@pytest.mark.parametrize("matrices", [ONE, CHAIN], ids=["1 DOF", "3 DOF"])
+@pytest.mark.parametrize(
+    "matrices", [pytest.param(ONE, id="1 DOF"), pytest.param(CHAIN, marks=pytest.mark.slow, id="3 DOF")]
+)
 def test_noise_free_tone_is_enough(matrices):
     records = one_at_a_time(matrices, DT, TONE)
     h = np.asarray(Wavelet("db4")(records).h)[:-1]

@@ -60,7 +60,8 @@ def test_a_coarse_subspace_regularizes():
     assert error(Direct()([record]).h, truth) < 0.05
 
 
-@pytest.mark.parametrize("dt", [pytest.param(1e-3, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [1e-3, 0.02])
 def test_white_excitation_with_noise(dt):
     rng = np.random.default_rng(0)
     u = np.zeros((4096, 3))

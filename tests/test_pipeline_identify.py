@@ -130,7 +130,9 @@ def run(row, seed, **options):
 
 
 # Every row in `test_accuracy_over_many_records`, which is slow: each new size of a system compiles for long.
-@pytest.mark.parametrize("name", ["one force", "mixed", pytest.param("free", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["one force", *(pytest.param(x, marks=pytest.mark.slow) for x in ("mixed", "free"))]
+)
 def test_accuracy_from_one_noisy_record(name):
     row = ROWS[name]
     found = run(row, 1)

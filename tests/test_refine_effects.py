@@ -65,6 +65,7 @@ TRUE = dict(zip(NAMES, [*MASS, *DAMPING, *STIFFNESS], strict=True))
 FRICTION = "coulomb_friction(ground, b1).force"
 
 
+@pytest.mark.slow
 def test_friction_and_all_elements_from_wrong_values(rubbing):
     model = chain([between("coulomb_friction", ("ground", "b1"), force=1.5)], wrong=0.3)
     found = jaxsid.refine(model, rubbing)
@@ -85,6 +86,13 @@ def test_friction_and_all_elements_from_wrong_values(rubbing):
     # the refined model holds its effect and simulates
     again = np.asarray(jaxsid.simulate(found.model, rubbing, initial="estimate"))
     assert (np.sqrt(((again - y) ** 2).mean(axis=0)) < np.hypot(0.012, 2 * spike) * y.std(axis=0)).all()
+
+
+def test_friction_beside_known_masses_and_dampers(rubbing):
+    model = chain([between("coulomb_friction", ("ground", "b1"), force=1.5)], wrong=0.0)
+    part = jaxsid.Record(rubbing.u[:800], rubbing.y[:800], DT, inputs=("drive",), outputs=("s0", "s1"))
+    found = jaxsid.refine(model, part, fixed=["*.mass", "*.damping"], validate=False)
+    check(found, {FRICTION: 3.0, "c1.stiffness": 900.0, "c2.stiffness": 700.0})
 
 
 @pytest.mark.slow

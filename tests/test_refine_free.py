@@ -98,6 +98,7 @@ def roots(matrices):
     ])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_damping_on_the_edge_is_the_best_positive_one():
     """Noise asks for negative damping somewhere: the answer is on the edge, and no positive matrices fit better."""
     truth = chain_model(([1.2, 0.8], [3000.0, 2000.0], [1.5, 0.0]))
@@ -248,6 +249,7 @@ def test_profile_ends_at_a_bound_and_needs_an_unknown():
         refine(truth, ir, profile=["*.mass"])
 
 
+@pytest.mark.slow
 def test_starts_find_what_the_nominal_model_leads_away_from():
     """Frequency responses around sharp resonances alone, where a fit from beside them sees no way to them."""
 

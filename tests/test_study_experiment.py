@@ -41,7 +41,7 @@ def close(experiment, tolerance):
 # --- exact recovery
 
 
-QUICK = (("chain2", "era"), ("chain3", "era_dc"), ("rig", "era"))
+QUICK = (("chain3", "era_dc"), ("rig", "era"))
 SLOW = [(s, r) for s in BUILT_IN for r in ("era", "era_dc") if s not in MODAL and (s, r) not in QUICK]
 
 

@@ -61,11 +61,13 @@ def found():
     return jaxsid.identify(rig_model_nominal(), rig_record(0))
 
 
+@pytest.mark.slow
 def test_noisy_record_of_the_twin(found):
     assert found.order == 3
     assert_identified(found)
 
 
+@pytest.mark.slow
 def test_cbsi_alone_gives_inertia_and_stiffness_but_not_the_split_of_damping(found):
     """Three states of two bodies: D[motor, load] hangs on the twist of the gearbox in the slow mode, which is
     a two-thousandth of the velocities; D[load, motor] does not."""

@@ -99,7 +99,7 @@ def test_era_dc_too():
         ),
     ],
 )
-@pytest.mark.parametrize("pole", [0.0, 0.3])
+@pytest.mark.parametrize("pole", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_the_closed_form_is_the_derivative_through_the_factorization(window, pole):
     ir = exact(pole)
     noise = IndependentNoise(jnp.asarray(np.random.default_rng(0).uniform(0.5, 2.0, ir.h.shape)) * 1e-6)
