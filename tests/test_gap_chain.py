@@ -8,7 +8,7 @@ from gap_helpers import with_effect as truth
 
 from jaxsid.gap.chain import Chain, Links
 from jaxsid.gap.fit import _evaluated, _led, _normal, links_of
-from jaxsid.gap.refit import Hypothesis, prior_of, refitted, shot_of, tied
+from jaxsid.gap.refit import Hypothesis, changes_of, prior_of, refitted, shot_of, tied
 from jaxsid.gap.setting import LARGE
 from jaxsid.mechanics.lumped import Effect
 
@@ -174,3 +174,16 @@ def test_a_tied_fit_from_far_off_takes_few_steps():
     assert far.fit.steps < 20
     assert far.fit.evidence == pytest.approx(near.fit.evidence, abs=0.1)
     np.testing.assert_allclose(far.fit.theta, near.fit.theta, atol=1e-3)
+
+
+def test_states_that_lead_nowhere_are_made_to_lead_to_one_another_at_once():
+    """Windows that stood alone hardly tell of hidden states; a search from jumps between them wanders off."""
+    u = drive(4 * SAMPLES)
+    of = bench(*colored(exact(u), 1), u=u)
+    chained, near = tied(of, refitted(of, Hypothesis()), steps=25)
+    rng = np.random.default_rng(2)
+    astray = [s + 10 * s.std(axis=0) * rng.standard_normal(s.shape) for s in near.fit.states]
+    start = {"changes": changes_of(near, chained), "states": astray}
+    found = refitted(chained, Hypothesis(), **start, steps=1)
+    assert found.fit.steps == 1
+    assert found.fit.evidence == pytest.approx(near.fit.evidence, abs=0.1)

@@ -97,7 +97,14 @@ def fitted(
         eased: unknowns that begin nearer to their prior's mean where the motion grows without bound.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
-    at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
+
+    def evaluated(theta: np.ndarray, states: list[np.ndarray]) -> _At:
+        return _evaluated(shot, blocks, links, prior, theta, states, substeps)
+
+    def led(at: _At) -> _At:
+        return evaluated(at.theta, _added(at.states, _led(at, prior, links)))
+
+    at = evaluated(theta, list(states))
     damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
     free, moved = 0, False
     for _ in range(HALVINGS):
@@ -105,19 +112,17 @@ def fitted(
             break
         theta = theta.copy()
         theta[eased] = np.maximum((theta[eased] + prior.mean[eased]) / 2, prior.least[eased])
-        at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
+        at = evaluated(theta, list(states))
+    if links.after.size and np.isfinite(at.cost):
+        # what windows that stood alone hardly told of their states need not lead from one to the next
+        at = min(at, led(at), key=lambda x: x.cost)
     while done - free < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, links, damping)
-        new = np.maximum(at.theta + move, prior.least)
-        found = _evaluated(
-            shot, blocks, links, prior, new, [a + b for a, b in zip(at.states, moves, strict=True)], substeps
-        )
+        found = evaluated(np.maximum(at.theta + move, prior.least), _added(at.states, moves))
         done += 1
         if links.after.size and np.isfinite(found.cost) and found.cost >= at.cost:
             # ties are stiff: what bends along the chain is made good by the states alone
-            moves = _led(found, prior, links)
-            states = [a + b for a, b in zip(found.states, moves, strict=True)]
-            found = _evaluated(shot, blocks, links, prior, new, states, substeps)
+            found = led(found)
             done += 1
         less = at.cost - found.cost
         if less > 0:
@@ -298,6 +303,10 @@ def _expected(at: _At, prior: Prior, links: Links) -> tuple[float, float]:
     by_states = (normal.slopes * back[:, :, p]).sum()
     by_unknowns = slope @ _solved(reduced[:, :p], slope[:, None])[:, 0]
     return 0.5 * float(by_unknowns), 0.5 * float(by_states)
+
+
+def _added(states: list[np.ndarray], moves: list[np.ndarray]) -> list[np.ndarray]:
+    return [a + b for a, b in zip(states, moves, strict=True)]
 
 
 def _led(at: _At, prior: Prior, links: Links) -> list[np.ndarray]:
