@@ -4,7 +4,7 @@ Levenberg and Marquardt over unknowns and all initial states, the latter elimina
 where windows lead to one another; Laplace's approximation at the end.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -104,18 +104,12 @@ def fitted(
     def led(at: _At) -> _At:
         return evaluated(at.theta, _added(at.states, _led(at, prior, links)))
 
-    at = evaluated(theta, list(states))
-    damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
-    free, moved = 0, False
-    for _ in range(HALVINGS):
-        if np.isfinite(at.cost) or not np.any(theta[eased]):
-            break
-        theta = theta.copy()
-        theta[eased] = np.maximum((theta[eased] + prior.mean[eased]) / 2, prior.least[eased])
-        at = evaluated(theta, list(states))
+    at = _begun(evaluated, theta, list(states), prior, eased)
     if links.after.size and np.isfinite(at.cost):
         # what windows that stood alone hardly told of their states need not lead from one to the next
         at = min(at, led(at), key=lambda x: x.cost)
+    damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
+    free, moved = 0, False
     while done - free < steps and np.isfinite(at.cost):
         move, moves = _step(at, prior, links, damping)
         found = evaluated(np.maximum(at.theta + move, prior.least), _added(at.states, moves))
@@ -170,6 +164,24 @@ class _At(NamedTuple):
     gram: np.ndarray
     equations: int
     ends: np.ndarray
+
+
+def _begun(
+    evaluated: Callable[[np.ndarray, list[np.ndarray]], _At],
+    theta: np.ndarray,
+    states: list[np.ndarray],
+    prior: Prior,
+    eased: slice,
+) -> _At:
+    """The first point, with unknowns nearer to their prior's mean where the motion grows without bound."""
+    at = evaluated(theta, states)
+    for _ in range(HALVINGS):
+        if np.isfinite(at.cost) or not np.any(theta[eased]):
+            break
+        theta = theta.copy()
+        theta[eased] = np.maximum((theta[eased] + prior.mean[eased]) / 2, prior.least[eased])
+        at = evaluated(theta, states)
+    return at
 
 
 class _Normal(NamedTuple):
