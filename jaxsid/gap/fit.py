@@ -82,6 +82,7 @@ def fitted(
     steps: int = STEPS,
     gain: float = GAIN,
     eased: slice = NONE,
+    linear: bool = False,
 ) -> Fit:
     """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated.
 
@@ -95,6 +96,7 @@ def fitted(
         steps: most evaluations; not counted are the first ones that only tell how much damping a step needs.
         gain: of the cost, in mean squares of what is left, that is not worth a step.
         eased: unknowns that begin nearer to their prior's mean where the motion grows without bound.
+        linear: whether the motion is, so that the states that go with unknowns are known at once.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
 
@@ -105,7 +107,7 @@ def fitted(
         return evaluated(at.theta, _added(at.states, _led(at, prior, links)))
 
     at = _begun(evaluated, theta, list(states), prior, eased)
-    if links.after.size and np.isfinite(at.cost):
+    if linear and links.after.size and np.isfinite(at.cost):
         # what windows that stood alone hardly told of their states need not lead from one to the next
         at = min(at, led(at), key=lambda x: x.cost)
     damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0

@@ -409,7 +409,7 @@ def refitted(
     # what was there before holds; the last effect is what is new
     end = len(start) + z.size
     last = slice(end - z.shape[1], end)
-    search = {"substeps": count, "steps": steps, "gain": gain, "eased": last}
+    search = {"substeps": count, "steps": steps, "gain": gain, "eased": last, "linear": hypothesis.linear}
     fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, **search)
     return _concluded(bench, hypothesis, shot, fit)
 
