@@ -5,7 +5,7 @@ from gap_bench import bench
 from gap_helpers import JOINT, drive
 from gap_helpers import with_effect as truth
 
-from jaxsid.gap.refit import FINEST, UNRESOLVED, Hypothesis, refitted, resolved
+from jaxsid.gap.refit import FINEST, UNRESOLVED, Hypothesis, changes_of, refitted, resolved
 from jaxsid.gap.shooting import products_of
 from jaxsid.mechanics.lumped import Effect
 
@@ -37,3 +37,21 @@ def test_steps_are_shorter_where_a_law_has_kinks():
     assert apart[0] > UNRESOLVED
     diverged = refitted(of, Hypothesis((effect("cubic_stiffness", ("b1", "b2"), coefficient=-1e9),)))
     assert resolved(of, diverged) is of
+
+
+def test_steps_are_shorter_where_a_number_lies_off_that_no_sample_shows():
+    """Many samples together tell more than each: a number is a tenth of its deviation off, and that is foreseen."""
+    y = truth(drive(), "bilinear_stiffness", JOINT, {"stiffness": 500.0})
+    level = 0.01 * y.std(axis=0)
+    of = bench(y + level * np.random.default_rng(0).standard_normal(y.shape), level)
+    found = refitted(of, Hypothesis((effect("bilinear_stiffness", ("b1", "b2"), stiffness=500.0),)))
+    for shift in (np.inf, 0.2):
+        assert resolved(of, found, shift=shift) is of
+    finer = resolved(of, found, shift=0.05)
+    assert finer.substeps > of.substeps
+    begin = {"changes": changes_of(found, of), "states": found.fit.states}
+    far = refitted(of._replace(substeps=8 * FINEST), found.hypothesis, **begin)
+    near = refitted(finer, found.hypothesis, **begin)
+    value = lambda x: x.hypothesis.effects[0].parameters["stiffness"] / found.deviations[0]["stiffness"]  # noqa: E731
+    assert 0.05 < abs(value(far) - value(found)) < 0.2
+    assert abs(value(far) - value(near)) < 0.05

@@ -82,7 +82,6 @@ def fitted(
     steps: int = STEPS,
     gain: float = GAIN,
     eased: slice = NONE,
-    linear: bool = False,
 ) -> Fit:
     """Least squares by Levenberg and Marquardt over unknowns and all initial states, the latter eliminated.
 
@@ -96,7 +95,6 @@ def fitted(
         steps: most evaluations; not counted are the first ones that only tell how much damping a step needs.
         gain: of the cost, in mean squares of what is left, that is not worth a step.
         eased: unknowns that begin nearer to their prior's mean where the motion grows without bound.
-        linear: whether the motion is, so that the states that go with unknowns are known at once.
     """
     links = links_of(blocks if np.isfinite(prior.jump).all() else ())
 
@@ -107,7 +105,7 @@ def fitted(
         return evaluated(at.theta, _added(at.states, _led(at, prior, links)))
 
     at = _begun(evaluated, theta, list(states), prior, eased)
-    if linear and links.after.size and np.isfinite(at.cost):
+    if links.after.size and np.isfinite(at.cost):
         # what windows that stood alone hardly told of their states need not lead from one to the next
         at = min(at, led(at), key=lambda x: x.cost)
     damping, growth, settled, done, idle = DAMPING, SLOWER, False, 1, 0
@@ -144,6 +142,31 @@ def fitted(
                 settled = True
                 break
     return _concluded(at, prior, links, done, settled)
+
+
+def newton_step(
+    shot: Shot,
+    blocks: Sequence[Block],
+    prior: Prior,
+    theta: Float[np.ndarray, " p"],
+    states: Sequence[Float[np.ndarray, "windows n"]],
+    *,
+    substeps: int,
+) -> Float[np.ndarray, " p"]:
+    """How far unknowns lie off those of the smallest cost, were it a parabola, initial states going with them.
+
+    Args:
+        shot: the hypothesis.
+        blocks: windows of the records.
+        prior: of unknowns and states.
+        theta: (p,) unknowns.
+        states: initial ones, of each block.
+        substeps: steps for each sampling interval.
+    """
+    links = links_of(blocks if np.isfinite(prior.jump).all() else ())
+    at = _evaluated(shot, blocks, links, prior, theta, list(states), substeps)
+    reduced, _, _ = _normal(at, prior, links).reduced()
+    return -_solved(reduced[:, :-1], reduced[:, -1:])[:, 0]
 
 
 class _At(NamedTuple):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsid.gap.fit import GAIN, STEPS, Fit, Prior, fitted
+from jaxsid.gap.fit import GAIN, STEPS, Fit, Prior, fitted, newton_step
 from jaxsid.gap.hypothesis import (
     FIXED,
     Moved,
@@ -312,21 +312,33 @@ def in_windows(bench: Bench, found: Refit) -> list[Products]:
     return products_of(found.shot, bench.blocks, found.fit.theta, found.fit.states, bench.substeps)
 
 
-def resolved(bench: Bench, found: Refit) -> Bench:
+def resolved(bench: Bench, found: Refit, *, shift: float = np.inf) -> Bench:
     """The bench with steps so short that the kinks of a law are not missed by more than hides in what is left.
+
+    Many samples together tell more than each: what no sample shows may be far more than the deviation of a number.
 
     Args:
         bench: records.
         found: a fit to all of it.
+        shift: of an unknown, in its deviations, from which on shorter steps are needed too.
     """
     left = _in_noise(bench, found)
     while bench.substeps < FINEST and np.isfinite(left).all():
         finer = bench._replace(substeps=min(FINER * bench.substeps, FINEST))
         now = _in_noise(finer, found)
-        if not np.sqrt(((now - left) ** 2).mean()) > UNRESOLVED * max(1.0, np.sqrt((left**2).mean())):
+        missed = np.sqrt(((now - left) ** 2).mean()) > UNRESOLVED * max(1.0, np.sqrt((left**2).mean()))
+        if not missed and not (np.isfinite(shift) and _shift(bench, finer, found) > shift):
             return bench
         bench, left = finer, now
     return bench
+
+
+def _shift(bench: Bench, finer: Bench, found: Refit) -> float:
+    """How far an unknown of a fit lies off for the length of its steps, in deviations; of the one farthest off."""
+    prior, fit = prior_of(bench, found.hypothesis, found.shot), found.fit
+    at = found.shot, bench.blocks, prior, fit.theta, fit.states
+    own, other = (newton_step(*at, substeps=b.substeps) for b in (bench, finer))
+    return float((np.abs(other - own) / np.sqrt(np.diag(fit.covariance))).max())
 
 
 def _in_noise(bench: Bench, found: Refit) -> Float[np.ndarray, " values"]:
@@ -409,7 +421,7 @@ def refitted(
     # what was there before holds; the last effect is what is new
     end = len(start) + z.size
     last = slice(end - z.shape[1], end)
-    search = {"substeps": count, "steps": steps, "gain": gain, "eased": last, "linear": hypothesis.linear}
+    search = {"substeps": count, "steps": steps, "gain": gain, "eased": last}
     fit = fitted(shot, bench.blocks, prior, np.maximum(theta, prior.least), given, **search)
     return _concluded(bench, hypothesis, shot, fit)
 

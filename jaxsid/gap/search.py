@@ -55,6 +55,7 @@ from jaxsid.gap.refit import (
     bench_of,
     changes_of,
     refitted,
+    resolved,
     states_without,
     tied,
     weighed_anew,
@@ -67,6 +68,7 @@ MOST_EFFECTS = 2
 TELLING = 4.0  # tempered gain of evidence from which on numbers are taken beside effects
 LACKING = 4  # springs, dampers, masses that are tried beside them
 POLISHED = 60  # most steps of the fit of what is chosen
+SHIFT = 0.3  # of its numbers, in their deviations, that steps may be too long by
 LEAST = 0.01  # part of all that is left that an effect must remove, or a first one MOSTLY what tests find
 MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
@@ -93,7 +95,7 @@ class Found(NamedTuple):
         """With the best of a round, fitted to the very bottom, its noise what is left there."""
         best, bench, last = ranking.ranked[0], ranking.bench, ranking.ranked[0].refit
         for anew in (False, True):
-            bench = weighed_anew(bench, last) if anew else bench
+            bench = weighed_anew(resolved(bench, last, shift=SHIFT), last) if anew else bench
             begin = {"changes": changes_of(last, bench), "states": last.fit.states}
             last = refitted(bench, last.hypothesis, steps=POLISHED, **begin)
             bench, last = tied(bench, last, steps=POLISHED)
