@@ -8,7 +8,7 @@ from gap_helpers import with_effect as truth
 
 from jaxsid.gap.chain import Chain, Links
 from jaxsid.gap.fit import _evaluated, _led, _normal, links_of
-from jaxsid.gap.refit import Hypothesis, changes_of, prior_of, refitted, shot_of, tied
+from jaxsid.gap.refit import BEFORE, Hypothesis, changes_of, prior_of, refitted, shot_of, tied
 from jaxsid.gap.setting import LARGE
 from jaxsid.mechanics.lumped import Effect
 
@@ -132,6 +132,16 @@ def test_a_lagging_signal_is_carried_from_window_to_window_in_its_own_unit(kind,
     signal = {"input": of.moved[0].u[:, 0], "sensor": of.moved[0].y[:, 1]}[where[0]]
     rms = np.sqrt((np.asarray(signal) ** 2).mean())
     np.testing.assert_allclose(of.state_deviations(found.hypothesis.effects)[6:], LARGE * rms)
+
+
+def test_what_was_before_a_record_is_no_larger_than_what_follows():
+    """Of what dies out before the first sample noise tells, times what is left of it there; the rest would ring."""
+    of = bench(*colored(truth(drive(), "actuator_lag", 0, {"time_constant": 0.05}), 3))
+    near = refitted(of, Hypothesis((Effect("actuator_lag", (("input", "drive"),), {"time_constant": 0.04}),)))
+    assert int(of.blocks[0].first[0]) < 0
+    for found in (near, tied(of, near, steps=25)[1]):
+        usual = of.state_deviations(found.hypothesis.effects) / LARGE
+        assert (np.abs(found.fit.states[0][0]) < BEFORE * usual).all()
 
 
 def test_windows_stay_apart_where_the_model_is_wrong(records):

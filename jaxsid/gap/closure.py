@@ -180,7 +180,7 @@ def _states(
     states = bench.state_deviations(found.hypothesis.effects)
     least, most = np.full(len(theta), -np.inf), np.ones(len(theta))
     jump = JUMP * noise_part(bench) * states / LARGE if followed else np.full(len(states), np.inf)
-    prior = Prior(same, theta, least, most, states, jump)
+    prior = Prior(same, theta, least, most, states, states, jump)
     begin = [motion[np.clip(np.asarray(b.first) - start, 0, len(motion) - 1)] for b in blocks]
     begin = [np.pad(x, ((0, 0), (0, len(states) - x.shape[1]))) for x in begin]
     steps = STEPS if followed else ROUNDS

@@ -60,6 +60,7 @@ class Prior(NamedTuple):
         least: (p,) smallest values that make sense.
         most: (p,) largest change in a step.
         states: (n,) standard deviations of initial states.
+        before: (n,) likewise, of those before a record's start, where nothing is measured that could tell of them.
         jump: (n,) from where a window ends to where the next begins; infinite where each stands alone.
     """
 
@@ -68,6 +69,7 @@ class Prior(NamedTuple):
     least: Float[np.ndarray, " p"]
     most: Float[np.ndarray, " p"]
     states: Float[np.ndarray, " n"]
+    before: Float[np.ndarray, " n"]
     jump: Float[np.ndarray, " n"]
 
 
@@ -180,6 +182,7 @@ class _At(NamedTuple):
         gram: (windows, q, q) of all windows.
         equations: how many entries of the residual count.
         ends: (windows, n, 1 + p + n) states where the next window begins, and their slopes.
+        spread: (windows, n) standard deviations of initial states beforehand.
     """
 
     theta: np.ndarray
@@ -189,6 +192,7 @@ class _At(NamedTuple):
     gram: np.ndarray
     equations: int
     ends: np.ndarray
+    spread: np.ndarray
 
 
 def _begun(
@@ -272,17 +276,19 @@ def _evaluated(
     gram, ends = (np.concatenate([np.asarray(getattr(x, n)) for x in parts]) for n in ("gram", "ends"))
     equations = sum(int(np.asarray(x.equations).sum()) for x in parts)
     squares = float(gram[:, -1, -1].sum())
-    at = _At(theta, states, np.inf, squares, gram, equations, ends)
+    first = np.concatenate([np.asarray(b.first) for b in blocks])
+    spread = np.where(first[:, None] < 0, prior.before, prior.states)
+    at = _At(theta, states, np.inf, squares, gram, equations, ends, spread)
     with np.errstate(over="ignore"):  # a step too far is refused below
-        own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (_stray(at, prior, links) ** 2).sum()
+        own = (((theta - prior.mean) / prior.deviation) ** 2).sum() + (_stray(at, links) ** 2).sum()
         own += (_jumps(at, prior, links) ** 2).sum()
         cost = 0.5 * (squares + float(own))
     return at._replace(cost=cost) if np.isfinite(gram).all() and np.isfinite(cost) else at
 
 
-def _stray(at: _At, prior: Prior, links: Links) -> np.ndarray:
+def _stray(at: _At, links: Links) -> np.ndarray:
     """(windows, n) initial states in deviations, 0 of those that another window leads to."""
-    found = np.concatenate(at.states) / prior.states
+    found = np.concatenate(at.states) / at.spread
     found[links.after] = 0.0
     return found
 
@@ -297,10 +303,10 @@ def _normal(at: _At, prior: Prior, links: Links) -> _Normal:
     own = at.gram[:, :p, :p].sum(axis=0) + np.diag(prior.deviation**-2)
     slope = at.gram[:, :p, -1].sum(axis=0) + (at.theta - prior.mean) / prior.deviation**2
     mixed, inner = at.gram[:, p:-1, :p].copy(), at.gram[:, p:-1, p:-1].copy()
-    free = np.ones(len(inner))
-    free[links.after] = 0.0
-    inner += free[:, None, None] * np.diag(prior.states**-2)
-    slopes = at.gram[:, p:-1, -1] + _stray(at, prior, links) / prior.states
+    told = at.spread**-2
+    told[links.after] = 0.0
+    inner += told[:, :, None] * np.eye(told.shape[1])
+    slopes = at.gram[:, p:-1, -1] + _stray(at, links) / at.spread
     # a jump in deviations, and its slopes by the unknowns and by the state before
     jumps = _jumps(at, prior, links)
     by_unknowns = -at.ends[links.before, :, 1 : 1 + p] / prior.jump[:, None]

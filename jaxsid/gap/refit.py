@@ -37,6 +37,7 @@ MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
 LEAST_ELEMENT = -0.95
 FARTHEST = 4.0  # deviations of its prior that the size of a law lies off
+BEFORE = 3.0  # times what states usually are, of those before a record's start
 JUMP = 0.02  # of the noise next to the signal: far less than a window tells of its states
 STEPS_A_PERIOD = 20.0  # of the quickest vibration
 MOST_SUBSTEPS = 8
@@ -464,7 +465,8 @@ def prior_of(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     most[: len(elements)] = MOST_ELEMENT
     most[len(elements) : len(elements) + len(large)] *= large
     states = bench.state_deviations(hypothesis.effects)
-    return Prior(deviation, np.zeros(len(deviation)), least, most, states, bench.jump * states / LARGE)
+    usual = states / LARGE
+    return Prior(deviation, np.zeros(len(deviation)), least, most, states, BEFORE * usual, bench.jump * usual)
 
 
 def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Refit:
