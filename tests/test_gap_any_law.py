@@ -24,6 +24,7 @@ from jaxsid.gap.shooting import slopes
 from jaxsid.gap.verdict import LAPSE, OTHER, verdict_of
 from jaxsid.gap.words import about_doubt
 from jaxsid.mechanics.lumped import Effect, second_order
+from jaxsid.physical.elements import element_matrices
 
 B12, B23 = Place("between", ("b1", "b2")), Place("between", ("b2", "b3"))
 CUBIC = Hypothesis((Effect("cubic_stiffness", (("between", B12.ends),), {"coefficient": 4e5}),))
@@ -169,6 +170,16 @@ def test_a_law_that_stands_for_another_leaves_it_what_that_has_of_its_own(law):
     assert told.part > 0.8 * beyond
 
 
+@pytest.mark.parametrize(
+    ("law", "straight"), [(lambda d, v: 4.0 * max(v, 0.0), False), (lambda d, v: 2.0 * v, True)]
+)
+def test_a_damper_that_is_off_stands_for_no_damper_of_one_direction(law, straight):
+    wrong = [x.name for x in element_matrices(chain()).listed].index("c2.damping")
+    of, found = fitted_to(*reading("none", {}, law), Hypothesis(wrong=(wrong,)))
+    assert found.fit.theta[wrong] > 0.4
+    assert (any_law(of, found, B12).p_value > 0.01) == straight
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "verdict"), [(lambda d, v: 3e4 * d**2 * v, "unknown"), (lambda d, v: 1e6 * d**3, "effect")]
@@ -198,11 +209,16 @@ def test_places_of_smooth_laws_alone():
     assert of(("cubic_stiffness", here), ("end_stop", {"between": ("b2", "b1")})) == (B12,)
     assert of(("quadratic_damping", wall)) == (Place("between", ("b1", "ground")),)
     assert of(("constant_load", {"body": "b1"}), ("cubic_stiffness", here)) == (B12,)
-    # dry friction, memory, time, numbers and signals are no sum of shapes
+    assert (
+        of(("stiffness_error", here))
+        == of(("damping_error", here), ("sensor_bias", {"sensor": "s1"}))
+        == (B12,)
+    )
+    # dry friction, memory, time, masses and signals are no sum of shapes
     assert of(("coulomb_friction", here), ("cubic_stiffness", here)) == ()
     assert of(("constant_load", {"body": "b1"}), ("coulomb_friction", wall)) == ()
     assert of(("hysteresis", here)) == of(("time_varying_stiffness", here)) == ()
-    assert of(("stiffness_error", here)) == of(("sensor_gain", {"sensor": "s1"})) == ()
+    assert of(("mass_error", {"body": "b1"})) == of(("sensor_gain", {"sensor": "s1"})) == ()
     assert of(("missing_mode", {"body": "b1"})) == of(("periodic_disturbance", {"body": "b1"})) == ()
 
 

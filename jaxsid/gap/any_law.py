@@ -28,7 +28,7 @@ SMALL = 1e-4  # of the force that moves the bodies there: a law is as good as st
 
 
 def smooth_places(selected: Sequence[Explanation]) -> tuple[Place, ...]:
-    """Where laws were found, all of which such a sum could be.
+    """Where laws were found, all of which such a sum could be; a damper or spring that is off is a straight one.
 
     Dry friction and hysteresis are richer at small speeds than any law of theirs, and no sum is in their place. A load
     that is the same at all times is no law of the motion, and is there whatever else is.
@@ -40,7 +40,7 @@ def smooth_places(selected: Sequence[Explanation]) -> tuple[Place, ...]:
     for x in selected:
         where, *ends = ends_of(x.place)
         kind = CATALOGUE[x.kind]
-        if where == "between" and x.kind not in ERRORS.values() and not kind.steady:
+        if where == "between" and x.kind != ERRORS["mass"] and not kind.steady:
             at[tuple(ends)] = at.get(tuple(ends), True) and kind.smooth
     return tuple(Place("between", ends) for ends, smooth in at.items() if smooth)
 

@@ -145,7 +145,7 @@ def _imitating(pairs: list[tuple[Explanation, Explanation]]) -> tuple[Explanatio
 def _instead_of_another(causes: Causes) -> tuple[Explanation, ...]:
     """Laws beside which one of another shape explains what they leave."""
     at = {ends_of(p.as_dict()) for p in causes.unlisted}
-    return tuple(x for x in causes.selected if ends_of(x.place) in at and x.kind not in ERRORS.values())
+    return tuple(x for x in causes.selected if ends_of(x.place) in at and x.kind != ERRORS["mass"])
 
 
 def _beside(causes: Causes) -> int:
