@@ -398,8 +398,8 @@ def _concluded(at: _At, prior: Prior, links: Links, steps: int, settled: bool) -
     reduced, back, determinant = normal.reduced()
     scale, scaled = _unit(reduced[:, :p])
     determinant += 2 * float(np.log(scale).sum()) + float(np.linalg.slogdet(scaled)[1])
-    free = len(back) - len(links.after)
-    determinant += 2 * float(np.log(prior.deviation).sum() + free * np.log(prior.states).sum())
+    free = np.setdiff1d(np.arange(len(back)), links.after)
+    determinant += 2 * float(np.log(prior.deviation).sum() + np.log(at.spread[free]).sum())
     if len(links.after):
         determinant += 2 * float(len(links.after) * np.log(prior.jump).sum())
     evidence = -at.cost - 0.5 * determinant
