@@ -35,6 +35,26 @@ def test_what_a_search_expects_is_what_a_full_step_brings():
     assert at.cost > costs[1] > costs[0]
 
 
+def test_evidence_is_that_of_all_unknowns_and_states_at_once():
+    """Laplace with one dense matrix, the states before the record's start likely to be smaller than others."""
+    y, level = colored(exact(drive()), 2)
+    of = bench(y, level, wide=True)
+    found = refitted(of, Hypothesis(), steps=60)
+    shot = shot_of(of, ())
+    prior, fit = prior_of(of, Hypothesis(), shot), found.fit
+    at = _evaluated(shot, of.blocks, links_of(()), prior, fit.theta, list(fit.states), of.substeps)
+    p, (windows, n) = len(fit.theta), fit.states[0].shape
+    spread = np.tile(prior.states, (windows, 1))
+    spread[np.asarray(of.blocks[0].first) < 0] = prior.before
+    beforehand = np.concatenate([prior.deviation, spread.ravel()])
+    whole = np.diag(beforehand**-2)
+    for w, gram in enumerate(np.asarray(at.gram)[:, :-1, :-1]):
+        own = np.r_[:p, p + n * w : p + n * (w + 1)]
+        whole[np.ix_(own, own)] += gram
+    unit = whole * np.outer(beforehand, beforehand)
+    assert fit.evidence == pytest.approx(-at.cost - 0.5 * np.linalg.slogdet(unit)[1], abs=0.01)
+
+
 @pytest.mark.parametrize("off", [0.0, 0.01])
 def test_a_search_does_not_stop_along_a_valley(off):
     """One input, one sensor: all numbers and the gain may move together, and all but their tolerance is indifferent."""
