@@ -145,6 +145,7 @@ def _across(states, place):
 # laws that are there, and laws that stand for others
 
 
+@pytest.mark.slow
 def test_a_law_that_is_there_leaves_nothing_to_another():
     of, found = fitted_to(*reading("cubic_stiffness", {"coefficient": 1e6}))
     assert found.fit.squares / found.fit.equations == pytest.approx(1, abs=0.1)

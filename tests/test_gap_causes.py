@@ -322,6 +322,7 @@ def two(monkeypatch):
         module, "candidates_of", lambda look: (candidate("coulomb_friction", B23, force=1.0),)
     )
     monkeypatch.setattr(module, "tied", lambda bench, found, **_: (bench, found))
+    monkeypatch.setattr(module, "resolved", lambda bench, found, **_: bench)
     monkeypatch.setattr(module, "weighed_anew", lambda bench, found, **_: bench)
 
     def set_up(evidences, deviation=0.1):

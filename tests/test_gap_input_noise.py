@@ -138,6 +138,7 @@ def test_more_than_a_sensor_of_inputs_has_is_a_gap():
     assert found.null.input_noise == (0.0,)
 
 
+@pytest.mark.slow
 def test_a_random_force_elsewhere_is_no_noise_of_the_input():
     u = drive(SAMPLES, 3)
     model = replace(chain(), inputs=(Input("drive", "b1"), Input("other", "b3")))
@@ -156,6 +157,7 @@ def test_a_random_force_elsewhere_is_no_noise_of_the_input():
     assert {t.name: t.p_value for t in found.null.tests}[COMMON] < 1e-9
 
 
+@pytest.mark.slow
 def test_one_sensor_tells_it_by_the_peaks_of_the_model():
     """Less than there is, as long as elements were fitted as if it were not."""
     found = [input_noise(*beside(alone(measured(0.01, seed)))) for seed in range(12)]
@@ -177,7 +179,7 @@ def test_one_sensor_tells_nothing_where_there_is_none(pole):
 
 # where laws were claimed as long as this noise was not allowed for
 @pytest.mark.parametrize(
-    "seed", [0, 22, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (24, 26, 31, 32))]
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (22, 24, 26, 31, 32))]
 )
 def test_one_sensor_and_a_measured_drive_are_agreement(seed):
     found = examine(chain(), [alone(measured(0.01, seed))])

@@ -50,7 +50,7 @@ def test_steps_are_shorter_where_a_number_lies_off_that_no_sample_shows():
     finer = resolved(of, found, shift=0.05)
     assert finer.substeps > of.substeps
     begin = {"changes": changes_of(found, of), "states": found.fit.states}
-    far = refitted(of._replace(substeps=8 * FINEST), found.hypothesis, **begin)
+    far = refitted(of._replace(substeps=2 * FINEST), found.hypothesis, **begin)
     near = refitted(finer, found.hypothesis, **begin)
     value = lambda x: x.hypothesis.effects[0].parameters["stiffness"] / found.deviations[0]["stiffness"]  # noqa: E731
     assert 0.05 < abs(value(far) - value(found)) < 0.2

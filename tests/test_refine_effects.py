@@ -110,6 +110,7 @@ def test_windows_records_and_absent_sensors(rubbing):
     assert ratio == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 def test_from_rest_without_effects(rubbing):
     """A linear model is fitted in time on request; what it lacks shows in what is left."""
     model = chain([], wrong=0.1)
