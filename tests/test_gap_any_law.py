@@ -14,7 +14,7 @@ from test_gap_verdict import causes, closure, examination, ranking
 
 from jaxsid import diagnose
 from jaxsid.gap.any_law import any_law, smooth_places
-from jaxsid.gap.causes import _unlisted
+from jaxsid.gap.causes import _doubted, _unlisted
 from jaxsid.gap.f_test import f_test
 from jaxsid.gap.look import Look
 from jaxsid.gap.null import Null
@@ -224,15 +224,9 @@ def test_places_of_smooth_laws_alone():
 
 
 @pytest.mark.parametrize(
-    ("p_value", "chance", "loose", "asked"),
-    [
-        (1e-4, 1e-12, np.inf, True),
-        (1e-4, 1e-3, np.inf, False),
-        (0.1, 1e-12, np.inf, None),
-        (1e-4, 1e-12, 0.1, None),
-    ],
+    ("chance", "loose", "asked"), [(1e-12, np.inf, True), (1e-3, np.inf, False), (1e-12, 0.1, None)]
 )
-def test_asked_where_tests_find_anything(monkeypatch, p_value, chance, loose, asked):
+def test_asked_where_windows_are_long(monkeypatch, chance, loose, asked):
     called = []
 
     def stand_in(*given):
@@ -242,9 +236,24 @@ def test_asked_where_tests_find_anything(monkeypatch, p_value, chance, loose, as
     monkeypatch.setattr("jaxsid.gap.causes.any_law", stand_in)
     selected = ranking(0.0, kinds=[("cubic_stiffness", B12.as_dict())]).ranked[:1]
     said = []
-    found = _unlisted(*left(p_value, None, loose), selected, said.append)
+    found = _unlisted(*left(1e-4, None, loose), selected, said.append)
     assert found == ((B12,) if asked else ())
     assert bool(called) == bool(said) == (asked is not None)
+
+
+def test_asked_where_tests_find_anything_or_refute_the_linear_models_of_which_one_was_found():
+    def of(p_value, finding, *found):
+        selected = [ranking(0.0, kinds=[x]).ranked[0] for x in found]
+        return _doubted(examination()._replace(finding=finding), left(p_value, None)[1], selected)
+
+    law, spring = ("cubic_stiffness", B12.as_dict()), ("stiffness_error", B12.as_dict())
+    mass = ("mass_error", {"body": "b1"})
+    assert of(1e-4, "structure", law)
+    assert of(1e-4, "parameters", spring)
+    assert not of(0.1, "structure", law)
+    assert not of(0.1, "structure", spring, law)
+    assert of(0.1, "structure", spring, mass)
+    assert not of(0.1, "parameters", spring, mass)
 
 
 @pytest.mark.parametrize(("left_at", "told"), [((B12,), (B12,)), ((B23, B12), (B12,)), ((B23,), ())])

@@ -18,7 +18,7 @@ from jaxsid.gap.measure import is_free_or_unstable
 from jaxsid.gap.noise import REFUTED, Noise, no_louder, quieter
 from jaxsid.gap.null import SIGNIFICANT, Null, found_part
 from jaxsid.gap.places import Place
-from jaxsid.gap.ranking import WORTH, Explanation, Ranking, ends_of
+from jaxsid.gap.ranking import ERRORS, WORTH, Explanation, Ranking, ends_of
 from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
 from jaxsid.gap.search import searched
 from jaxsid.mechanics.lumped import LumpedModel
@@ -116,7 +116,7 @@ def causes_of(
     linear = best_linear(bench, changes_of(chosen, bench))
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
-    unlisted = _unlisted(bench, look, selected, say)
+    unlisted = _unlisted(bench, look, selected, say) if _doubted(found, look, selected) else ()
     say("how far the gap shrinks")
     ends = tuple(len(r.y) for r in seen)
     motions = motions_to_begin(bench, whole, found.noises, found.scored)
@@ -157,14 +157,20 @@ def causes_of(
     )
 
 
+def _doubted(found: Examination, look: Look, selected: Sequence[Explanation]) -> bool:
+    """Whether tests find anything left, or had refuted every linear model but nothing else was found than one."""
+    linear = all(x.kind in ERRORS.values() for x in selected)
+    return look.null.p_value < SIGNIFICANT or (linear and found.finding == "structure")
+
+
 def _unlisted(
     bench: Bench, look: Look, selected: Sequence[Explanation], say: Callable[[str], None]
 ) -> tuple[Place, ...]:
-    """Places of laws found, where tests find anything, at which a law of another shape surely explains more.
+    """Places of laws found at which a law of another shape surely explains more.
 
     Windows of a few samples forgive what would tell. What more probably arises elsewhere is for another effect.
     """
-    if not selected or look.null.p_value >= SIGNIFICANT or np.isfinite(bench.loose):
+    if not selected or np.isfinite(bench.loose):
         return ()
     places, at = smooth_places(selected), look.scored
     if at is not None:
