@@ -21,6 +21,7 @@ from jaxsid.gap.windows import Block
 from jaxsid.mechanics.effects.catalogue import Sorted
 from jaxsid.mechanics.sensitivity import Laws, LinearPart, Windows, linear_part, marched
 from jaxsid.mechanics.slots import Slots
+from jaxsid.parallel import side_by_side
 from jaxsid.physical.motion import counted
 from jaxsid.records import SecondOrderModel
 
@@ -234,7 +235,12 @@ def products_of(
         substeps: steps for each sampling interval.
     """
     each = ready_for(shot, blocks, theta, substeps)
-    return [products(x, b, jnp.asarray(s)) for x, b, s in zip(each, blocks, states, strict=True)]
+
+    def of(given: tuple[Prepared, Block, np.ndarray]) -> Products:
+        # XLA would run one after the other
+        return jax.block_until_ready(products(given[0], given[1], jnp.asarray(given[2])))
+
+    return side_by_side(of, zip(each, blocks, states, strict=True))
 
 
 def ready_for(
