@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled, compiled_in_full
 from jaxsid.gap.evidence import factor_of
 from jaxsid.gap.setting import Setting
 from jaxsid.gap.spectra import Motion, Spectra, in_time, parameter_columns, readings
@@ -79,7 +79,7 @@ def sizes(given: Setting, slots: Slots, motion: Motion) -> Amplitudes:
     return lax.map(one, (slots, motion))
 
 
-@compiled
+@compiled_in_full
 def products(
     given: Setting, slots: Slots, motion: Motion, jumps: Array, probes: Mapping[str, Array], where: str
 ) -> dict[str, Products]:

@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled, compiled_in_full
 from jaxsid.gap.evidence import Force, Table, density, factor_of, split, table
 from jaxsid.gap.places import Place, joint_of
 from jaxsid.gap.setting import Setting
@@ -136,7 +136,7 @@ def _read_before(spectra: Spectra, port: Ports, size: Extent) -> Complex[Array, 
     return step[:, None] * seen / jnp.maximum(size.rms[0], jnp.finfo(seen.dtype).tiny)
 
 
-@compiled
+@compiled_in_full
 def tables(
     given: Setting,
     ports: Ports,

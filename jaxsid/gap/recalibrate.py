@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.evidence import factor_of, table
 from jaxsid.gap.noise import Noise, residual_noise
 from jaxsid.gap.resume import step
@@ -210,7 +210,7 @@ def _weights(setting: Setting) -> Array:
     return setting.spectra.weight[:, None] * (setting.scale > 0)
 
 
-@compiled
+@compiled_in_full
 def beside(given: Setting) -> Linear:
     """A model's response from the initial state that fits, what it leaves, and how that changes with the elements.
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxsid.checks import require, require_finite
-from jaxsid.compilation import compiled
+from jaxsid.compilation import compiled, compiled_in_full
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.inverses import inverse_each
@@ -152,7 +152,7 @@ def _driven(
     return plain, discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=hold)
 
 
-@compiled
+@compiled_in_full
 def _spectra(u: Array, y: Array, present: Array, model: _Sampled) -> Spectra:
     samples, plain, states = len(u), model.plain, model.states
     eye = jnp.eye(len(plain.A), dtype=plain.A.dtype)

@@ -4,7 +4,7 @@ Runge and Kutta's method with the matrix exponential (S. Cox and P. Matthews, J.
 which the laws' forces enter through few ports only; dry friction acts on top, with its mean over each step.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from jaxsid.mechanics.augmented import Augmented
 from jaxsid.mechanics.dry_friction import acting, friction, holding
 from jaxsid.mechanics.effects.catalogue import forces, possible, rates, slips
 from jaxsid.mechanics.effects.kind import Motion
-from jaxsid.mechanics.functions_of_matrices import phi_functions
+from jaxsid.mechanics.functions_of_matrices import less_identity_by_phi
 from jaxsid.mechanics.held_input import Late, parabola_over_step
 from jaxsid.mechanics.slots import Slots
 
@@ -57,34 +57,41 @@ class Step(eqx.Module):
     give: Array
 
 
-def phi_columns(A: Array, columns: Array, h: Array) -> tuple[Array, Array, Array, Array]:
+def phi_columns(
+    A: Array, columns: Array, h: Array, less_identity: Callable[[Array], Array] = less_identity_by_phi
+) -> tuple[Array, Array, Array, Array]:
     """e^(A h), and h phi_k(A h) times columns for k = 1, 2, 3, all from one exponential.
 
     Args:
         A: (n, n).
         columns: (n, count).
         h: time, s.
+        less_identity: e^L - I of a matrix; this one can be differentiated backwards.
     """
     n, count = columns.shape
     top = jnp.concatenate([A * h, columns * h, jnp.zeros((n, 2 * count), A.dtype)], axis=1)
     shift = jnp.eye(3 * count, n + 3 * count, n + count, dtype=A.dtype)
     whole = jnp.concatenate([top, shift])
-    first, _ = phi_functions(whole)
-    found = jnp.eye(len(whole), dtype=A.dtype) + whole @ first
+    found = jnp.eye(len(whole), dtype=A.dtype) + less_identity(whole)
     parts = (found[:n, n + k * count : n + (k + 1) * count] for k in range(3))
     one, two, three = parts
     return found[:n, :n], one, two, three
 
 
-def moved_by(system: Augmented, times: Float[Array, " k"]) -> tuple[Array, Array, Array, Array]:
+def moved_by(
+    system: Augmented,
+    times: Float[Array, " k"],
+    less_identity: Callable[[Array], Array] = less_identity_by_phi,
+) -> tuple[Array, Array, Array, Array]:
     """`phi_columns` of all ports, then all inputs, for several times at once, which makes a short program.
 
     Args:
         system: from `augmented`.
         times: s.
+        less_identity: as of `phi_columns`.
     """
     columns = jnp.concatenate([system.G, system.B], axis=1)
-    return jax.vmap(partial(phi_columns, system.A, columns))(times)
+    return jax.vmap(lambda h: phi_columns(system.A, columns, h, less_identity))(times)
 
 
 def pushed(moved: Sequence[Array], share: float) -> tuple[Array, Array, Array]:

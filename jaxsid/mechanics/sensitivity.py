@@ -8,7 +8,7 @@ prepares them for all sorts of laws.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,11 @@ from jaxsid.mechanics.augmented import augmented
 from jaxsid.mechanics.dry_friction import friction, holding
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, Sorted, slips, sort_of
 from jaxsid.mechanics.effects.kind import Kind, Motion
-from jaxsid.mechanics.held_input import Late, parabola_over_step, value_at_sample
+from jaxsid.mechanics.functions_of_matrices import less_identity_by_squaring
+from jaxsid.mechanics.held_input import parabola_over_step, value_at_sample
+from jaxsid.mechanics.input_lines import Arrival, direct_of_lines, input_lines, of_lines
 from jaxsid.mechanics.integrate import moved_by, pushed, step_of
-from jaxsid.mechanics.nonlinear import Scaled, held, scaled_inputs
+from jaxsid.mechanics.nonlinear import Scaled, scaled_inputs
 from jaxsid.mechanics.slots import Slots
 from jaxsid.records import SecondOrderModel
 
@@ -67,6 +69,18 @@ class LinearPart(NamedTuple):
     inputs: Scaled
 
 
+PRODUCTS = (
+    "step",
+    "stages",
+    "weights",
+    "rubs",
+    "pull",
+    "read",
+    "after",
+    "still",
+)  # matrices that columns go through
+
+
 class Marched(NamedTuple):
     """Readings with their slopes, and forces.
 
@@ -97,7 +111,8 @@ def linear_part(linear: SecondOrderModel, slots: Slots, dt: Array, substeps: Arr
     back = jnp.ceil(delay)
     part = back - delay
     times = jnp.concatenate([jnp.stack([h, h / 2]), part * dt])
-    moved = moved_by(system, times)
+    # its slopes are many, all forwards
+    moved = moved_by(system, times, less_identity_by_squaring)
     step = step_of(system, moved)
     none = jnp.zeros_like(step.middle)
     of_stages = (
@@ -168,24 +183,24 @@ class Laws(NamedTuple):
 
 
 class _March(NamedTuple):
-    """What stays the same on the way: linear part, its slopes, the effects, times, what speeds are of the state."""
+    """What stays the same on the way: linear part, its slopes, effects, arrival, times, speeds as of the state."""
 
     own: LinearPart
     slopes: LinearPart
     laws: Laws
+    arrival: Arrival
     dt: Array
     substeps: Array
     speeds: Array
 
 
 class _Row(NamedTuple):
-    """Of one sample: fields of `Late`, (5, inputs, windows), their slopes, (5, inputs, windows, p), its numbers.
+    """Of one sample: columns of the lines that inputs follow, from `input_lines`, and its numbers.
 
     `last` is 1 where its states are wanted.
     """
 
-    inputs: Array
-    moved: Array
+    lines: Array
     numbers: Array
     last: Array
 
@@ -213,20 +228,26 @@ def marched(own: LinearPart, slopes: LinearPart, laws: Laws, windows: Windows, s
     (n, count), p = (states.shape[1], len(kinds)), slopes.part.shape[-1]
     # a step's start is seen the same however long it is
     speeds = own.step[n + count : n + 2 * count, :n]
-    march = _March(own, slopes, laws, windows.dt, substeps, speeds)
-    inputs, moved = _inputs(own.inputs, slopes.inputs, windows)
+    # before the loop, which would turn them round for each product
+    along = {name: jnp.swapaxes(getattr(slopes, name), -1, -2) for name in PRODUCTS}
+    slopes = slopes._replace(**along)
+    lines, arrival = input_lines(own.inputs, slopes.inputs, windows.u, windows.ramps)
+    lines = lines[windows.lead :]
+    march = _March(own, slopes, laws, arrival, windows.dt, substeps, speeds)
     Z = jnp.zeros((n, 1 + p + n, len(states)), states.dtype).at[:, 0].set(states.T)
     Z = Z.at[:, 1 + p :].set(jnp.eye(n, dtype=Z.dtype)[:, :, None])
     # a speed that is nothing but rounding is rest
     speed, size = speeds @ states.T, 1e-12 * jnp.abs(speeds) @ jnp.abs(states.T)
     sliding = jnp.where(jnp.abs(speed) > size, jnp.sign(speed), 0.0)
-    numbers = jnp.arange(len(inputs))
-    rows = _Row(inputs, moved, windows.first + numbers[:, None].astype(Z.dtype), numbers == windows.end)
+    numbers = jnp.arange(len(lines))
+    rows = _Row(lines, windows.first + numbers[:, None].astype(Z.dtype), numbers == windows.end)
     (*_, ends), (read, after, forces) = lax.scan(partial(_sample, march), (Z, sliding, Z), rows)
-    direct = _columns(
-        lambda x: _direct(*x), (own.direct, own.part, inputs), (slopes.direct, slopes.part, moved)
-    )
-    outputs = read + jnp.concatenate([after[1:], after[-1:]]) + _wide(direct, n)
+    # all samples are columns here
+    flat = jnp.moveaxis(lines, 0, -1)
+    direct = direct_of_lines((own.direct, slopes.direct), (own.part, slopes.part), arrival)
+    driven = _through(*direct, flat.reshape(*flat.shape[:2], -1))
+    driven = jnp.moveaxis(driven.reshape(len(driven), *flat.shape[1:]), -1, 0)
+    outputs = read + jnp.concatenate([after[1:], after[-1:]]) + _wide(driven, n)
     if "linear" in kinds.sorts:
         # before the record there was rest
         at = jnp.arange(len(read))[:, None] - own.back.astype(int)
@@ -246,14 +267,14 @@ def _sample(march: _March, carry: tuple, row: _Row) -> tuple[tuple, tuple]:
     end = lax.fori_loop(0, march.substeps, lambda i, at: _substep(march, row, i, at), begin)
     begun = end.begun
     if "dry" in kinds.sorts:
-        now = _wide(_columns(lambda x: value_at_sample(_late(x)), row.inputs, row.moved), len(Z))
+        now = _wide(_through(*of_lines(lambda x: (value_at_sample(x),), march.arrival), row.lines), len(Z))
         gain = _through(own.pull, slopes.pull, jnp.concatenate([Z, now, begun]))
         at = own.pull.shape[1] - 2 * count
-        give = -own.pull[:, at : at + count], -slopes.pull[:, at : at + count]
+        give = -own.pull[:, at : at + count], -jnp.swapaxes(slopes.pull[..., at : at + count], -1, -2)
         force, _ = _contact(_resting, march.laws, (_product(march.speeds, Z), gain), give, sliding)
         begun = begun.at[:count].add(force)
     if set(kinds.sorts) == {"linear"}:
-        read = _through(own.read[:, : len(Z)], slopes.read[:, : len(Z)], Z)
+        read = _through(own.read[:, : len(Z)], slopes.read[..., : len(Z)], Z)
         after = jnp.zeros_like(read)
     else:
         read = _through(own.read, slopes.read, jnp.concatenate([Z, end.mean, begun]))
@@ -266,9 +287,7 @@ def _substep(march: _March, row: _Row, i: Array, at: _At) -> _At:
     Z, sliding, mean, begun = at
     n, count = len(Z), len(laws.kinds)
     begin, length = i / march.substeps, 1 / jnp.asarray(march.substeps, Z.dtype)
-    push = _columns(
-        lambda x: jnp.concatenate(parabola_over_step(_late(x), begin, length)), row.inputs, row.moved
-    )
+    push = _through(*of_lines(lambda x: parabola_over_step(x, begin, length), march.arrival), row.lines)
     Y = _through(own.step, slopes.step, jnp.concatenate([Z, _wide(push, n)]))
     Z1, seen = Y[:n], Y[n:].reshape(3, 3 * count, *Z.shape[1:])
     if "law" in laws.kinds.sorts:
@@ -291,8 +310,8 @@ def _product(matrix: Array, columns: Array) -> Array:
 
 
 def _through(matrix: Array, slopes: Array, columns: Array) -> Array:
-    """(m, columns, windows): a matrix that has slopes, (m, k, p), by columns whose first is no slope."""
-    moved = jnp.einsum("mkp,kw->mpw", slopes, columns[:, 0])
+    """(m, columns, windows): a matrix that has slopes, (m, p, k), by columns whose first is no slope."""
+    moved = jnp.einsum("mpk,kw->mpw", slopes, columns[:, 0])
     after = columns.shape[1] - 1 - moved.shape[1]
     return _product(matrix, columns) + jnp.pad(moved, ((0, 0), (1, after), (0, 0)))
 
@@ -300,44 +319,6 @@ def _through(matrix: Array, slopes: Array, columns: Array) -> Array:
 def _wide(columns: Array, n: int) -> Array:
     """With slopes of nothing by the initial states."""
     return jnp.pad(columns, (*[(0, 0)] * (columns.ndim - 2), (0, n), (0, 0)))
-
-
-def _columns(of: Callable, at: Any, slopes: Any) -> Array:
-    """(..., 1 + p, windows): a function's value and slopes in all directions, the last axis of `slopes`."""
-    value = of(at)
-    moved = jax.vmap(lambda t: jax.jvp(of, (at,), (t,))[1], -1, -2)(slopes)
-    return jnp.concatenate([value[..., None, :], moved], axis=-2)
-
-
-def _inputs(own: Scaled, slopes: Scaled, windows: Windows) -> tuple[Array, Array]:
-    """(samples, 5, inputs, windows) fields of `Late`, and their slopes, with p as the last axis."""
-
-    def of(move: Array) -> Array:
-        scaled = jax.tree.map(lambda x, slope: x + slope @ move, own, slopes)
-        late = jax.vmap(lambda x: held(scaled, x, windows.ramps))(windows.u)
-        arrival = jnp.broadcast_to(late.arrival[:, None], late.new.shape)
-        each = (*late[:4], arrival)
-        return jnp.stack([jnp.moveaxis(x[:, windows.lead :], 0, -1) for x in each], axis=1)
-
-    nothing = jnp.zeros(slopes.gain.shape[-1], windows.u.dtype)
-    return of(nothing), jax.jacfwd(of)(nothing)
-
-
-def _late(lines: Array) -> Late:
-    return Late(lines[0], lines[1], lines[2], lines[3], lines[4])
-
-
-def _direct(direct: Array, part: Array, inputs: Array) -> Float[Array, "samples outputs windows"]:
-    """What the inputs add to readings."""
-
-    def of(direct: Array, part: Array, late: Late) -> Array:
-        push = parabola_over_step(late, 0.0 * part, jnp.where(part > 0, part, 1.0))
-        since = part - late.arrival
-        now = jnp.where(since >= 0, late.new + since * late.new_slope, late.old + since * late.old_slope)
-        return direct @ jnp.concatenate([*push, now])
-
-    each = jax.vmap(of, in_axes=(0, 0, None))
-    return jax.vmap(lambda lines: each(direct, part, _late(lines)))(inputs)
 
 
 def _stages(march: _March, seen: Array, time: Array, h: Array) -> Array:
@@ -391,6 +372,7 @@ def _slope_of(kind: Kind) -> Callable[..., tuple[Array, Array]]:
 
 
 LAWS = [number for number, kind in enumerate(CATALOGUE.values()) if sort_of(kind) == "law"]
+BRANCH = np.searchsorted(LAWS, np.arange(len(CATALOGUE)))  # of each kind that is a law
 BRANCHES = [_slope_of(list(CATALOGUE.values())[number]) for number in LAWS]
 
 
@@ -409,8 +391,8 @@ def _ports(march: _March, seen: Array, time: Array) -> Array:
         if kinds.sorts[a] != "law":
             continue
         own = seen[a::count]
-        branch = jnp.searchsorted(jnp.asarray(LAWS), kinds.numbers[a])
         # of all laws only one is computed
+        branch = jnp.asarray(BRANCH)[kinds.numbers[a]]
         value, slope = lax.switch(branch, BRANCHES, parameters[a], *own[:, 0], spring[a], time)
         slope = slope[:, :, None]
         moved = slope[most] * own[0, 1:] + slope[most + 1] * own[1, 1:] + slope[most + 2] * own[2, 1:]
