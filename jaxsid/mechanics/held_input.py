@@ -51,11 +51,11 @@ def late_input(
     )
 
 
-def value_at_sample(late: Late) -> Float[Array, "samples inputs"]:
+def value_at_sample(late: Late) -> Float[Array, "*samples inputs"]:
     """The input at every sampling instant.
 
     Args:
-        late: from `late_input`.
+        late: from `late_input`, or of one sample, each field (inputs,).
     """
     old = late.old - late.arrival * late.old_slope
     return jnp.where(late.arrival > 0, old, late.new)

@@ -183,7 +183,10 @@ class Laws(NamedTuple):
 
 
 class _March(NamedTuple):
-    """What stays the same on the way: linear part, its slopes, effects, arrival, times, speeds as of the state."""
+    """What stays the same on the way: linear part, its slopes, effects, arrival, times, speeds as of the state.
+
+    Slopes of `PRODUCTS` have p as their last axis but one.
+    """
 
     own: LinearPart
     slopes: LinearPart
