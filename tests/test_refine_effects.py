@@ -90,7 +90,7 @@ def test_friction_and_all_elements_from_wrong_values(rubbing):
 
 def test_friction_beside_known_masses_and_dampers(rubbing):
     model = chain([between("coulomb_friction", ("ground", "b1"), force=1.5)], wrong=0.0)
-    part = jaxsid.Record(rubbing.u[:800], rubbing.y[:800], DT, inputs=("drive",), outputs=("s0", "s1"))
+    part = jaxsid.Record(rubbing.u[:400], rubbing.y[:400], DT, inputs=("drive",), outputs=("s0", "s1"))
     found = jaxsid.refine(model, part, fixed=["*.mass", "*.damping"], validate=False)
     check(found, {FRICTION: 3.0, "c1.stiffness": 900.0, "c2.stiffness": 700.0})
 
