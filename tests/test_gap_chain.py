@@ -197,3 +197,13 @@ def test_states_that_lead_nowhere_are_made_to_lead_to_one_another_at_once():
     found = refitted(chained, Hypothesis(), **start, steps=1)
     assert found.fit.steps == 1
     assert found.fit.evidence == pytest.approx(near.fit.evidence, abs=0.1)
+
+
+def test_where_states_do_all_that_a_parameter_does_no_more_is_known_than_beforehand():
+    """Wells of a ripple that are 0.6 um apart: within a window the motion tells nothing apart from how it began."""
+    of = bench(*colored(exact(drive()), 2))
+    ripple = {"amplitude": 1.0, "wavenumber": 1e7, "phase": 0.0}
+    found = refitted(of, Hypothesis((Effect("cogging_ripple", CUBIC.place, ripple),)), steps=1)
+    beforehand = prior_of(of, found.hypothesis, found.shot).deviation
+    np.testing.assert_array_equal(np.diag(found.fit.covariance), beforehand**2)
+    assert found.deviations[0]["phase"] > 1  # rad

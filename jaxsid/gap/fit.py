@@ -371,12 +371,17 @@ def _unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return scale, matrix / scale[:, None] / scale
 
 
-def _covariance(at: _At, normal: _Normal, reduced: np.ndarray, back: np.ndarray) -> Float[np.ndarray, "p p"]:
+def _covariance(at: _At, prior: Prior, reduced: np.ndarray, back: np.ndarray) -> Float[np.ndarray, "p p"]:
     """The inverse of the cost's second derivatives, its deviations no less than those that windows tell.
 
     Source: H. White, Econometrica 50 (1982).
     """
     p = len(reduced)
+    try:
+        np.linalg.cholesky(_unit(reduced)[1] + RIDGE * np.eye(p))
+    except np.linalg.LinAlgError:
+        # rounding is all that is left where states do what a parameter does: no more is known than beforehand
+        return np.diag(prior.deviation**2)
     found = _solved(reduced, np.eye(p))
     if at.squares < MORE * max(at.equations, 1) or len(back) < 2:
         return found
@@ -408,7 +413,7 @@ def _concluded(at: _At, prior: Prior, links: Links, steps: int, settled: bool) -
         states=tuple(at.states),
         squares=at.squares,
         equations=at.equations,
-        covariance=_covariance(at, normal, reduced[:, :p], back),
+        covariance=_covariance(at, prior, reduced[:, :p], back),
         evidence=evidence if np.isfinite(evidence) else -np.inf,
         steps=steps,
         settled=settled,
