@@ -1,11 +1,12 @@
 """Numbers of the nominal model that records contradict: a factor shared with a gain, and what is off beside it."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 from gap_helpers import chain, drive, exact, noisy, record
 
 from jaxsid.gap.examine import examine
-from jaxsid.gap.numbers import off_numbers
+from jaxsid.gap.numbers import at_the_least, off_numbers
 from jaxsid.gap.words import about_numbers, percent
 from jaxsid.physical.elements import Element, ElementValues
 from jaxsid.records import as_array
@@ -48,6 +49,21 @@ def test_signs_and_absent_numbers_are_left_alone():
         as_array([2.0, 3.0, 0.5, 0.0]),
     )
     assert off_numbers(odd) == (1.0, ())
+    assert at_the_least(odd) == ()
+
+
+def test_numbers_that_fits_made_as_small_as_they_may_be_are_named():
+    assert at_the_least(values([1.5, 0.05, 0.05, 0.0501])) == ("b.mass", "c.damping")
+
+
+def test_a_deviation_at_the_least_value_is_said_to_tell_nothing():
+    """The first damper has a hundredth of what the model has it."""
+    u, right = drive(), chain()
+    y = noisy(exact(u), 0.001)
+    wrong = eqx.tree_at(lambda m: m.damping, right, right.damping * np.array([100.0, 1.0, 1.0]))
+    found = examine(wrong, record(u, y))
+    assert at_the_least(found.elements) == ("c1.damping",)
+    assert "0.05 times the nominal value: c1.damping. " in about_numbers(found)[-1]
 
 
 @pytest.mark.slow

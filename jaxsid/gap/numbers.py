@@ -6,6 +6,8 @@ import numpy as np
 
 from jaxsid.physical.elements import ElementValues
 
+LEAST_CHANGE = -0.95  # of a number by its nominal value, beyond which no fit goes
+ROUNDING = 1e-6  # of a number in single precision
 SURE = 3.0  # standard deviations from which on a difference is one
 NOTABLE = 0.1  # of a number, from which on a difference is worth a word
 FEWEST = 3  # masses and stiffnesses of which a common factor may be told from a change of each
@@ -42,6 +44,18 @@ def off_numbers(values: ElementValues) -> OffNumbers:
     told = there & (np.abs(off) > np.maximum(NOTABLE, SURE * spread))
     order = sorted(np.flatnonzero(told), key=lambda i: -abs(off[i]))
     return OffNumbers(common, tuple((values.listed[i].name, float(ratio[i] / common)) for i in order))
+
+
+def at_the_least(values: ElementValues) -> tuple[str, ...]:
+    """Names of numbers that fits made as small as they may be.
+
+    Args:
+        values: refitted; those without a nominal value are left out.
+    """
+    value, nominal = np.asarray(values.values), np.asarray(values.nominal)
+    change = np.divide(value, nominal, out=np.ones_like(value), where=nominal != 0) - 1
+    small = np.flatnonzero(np.isclose(change, LEAST_CHANGE, rtol=ROUNDING, atol=0))
+    return tuple(values.listed[i].name for i in small)
 
 
 def _common(ratio: np.ndarray, spread: np.ndarray) -> float:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Complex, Float
 from jaxsid.compilation import compiled_in_full
 from jaxsid.gap.evidence import factor_of, table
 from jaxsid.gap.noise import Noise, residual_noise
+from jaxsid.gap.numbers import LEAST_CHANGE
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import Setting, element_directions, setting_of, slowest_rate
 from jaxsid.gap.spectra import Motion, in_time, motion_under, parameter_columns, spectra_of
@@ -148,7 +149,7 @@ def _fit(
         downhill = gram[:k, k] - best.change / prior**2
         step = np.linalg.solve(own + damping * np.diag(np.diag(own)), downhill)
         step = step / max(1.0, np.abs(step).max() / LARGEST)
-        candidate = np.maximum(best.change + step, -0.95)
+        candidate = np.maximum(best.change + step, LEAST_CHANGE)
         found = _evaluated(model, records, noises, candidate, prior, levels)
         gain = _cost(best, prior) - _cost(found, prior)
         if gain > 0:

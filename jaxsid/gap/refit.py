@@ -20,6 +20,7 @@ from jaxsid.gap.hypothesis import (
     with_parameters,
 )
 from jaxsid.gap.noise import Noise, residual_noise
+from jaxsid.gap.numbers import LEAST_CHANGE
 from jaxsid.gap.recalibrate import WIDE, Recalibrated
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
@@ -35,7 +36,6 @@ from jaxsid.records import Record
 
 MOST_ELEMENT = 0.3  # largest relative change of an element in a step
 MOST_UNKNOWN = 2.0  # of an unknown of an effect
-LEAST_ELEMENT = -0.95
 FARTHEST = 4.0  # deviations of its prior that the size of a law lies off
 BEFORE = 3.0  # times what states usually are, of those before a record's start
 JUMP = 0.02  # of the noise next to the signal: far less than a window tells of its states
@@ -456,7 +456,7 @@ def prior_of(bench: Bench, hypothesis: Hypothesis, shot: Shot) -> Prior:
     deviation = np.concatenate([elements, own, shifts])
     least = np.concatenate(
         [
-            np.full(len(elements), LEAST_ELEMENT),
+            np.full(len(elements), LEAST_CHANGE),
             shot.coordinates.least().ravel(),
             np.full(len(shifts), -np.inf),
         ]

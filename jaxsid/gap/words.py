@@ -8,7 +8,7 @@ from jaxsid.gap.examine import Examination
 from jaxsid.gap.experiment import Experiment
 from jaxsid.gap.locate import located
 from jaxsid.gap.measure import Gap
-from jaxsid.gap.numbers import off_numbers
+from jaxsid.gap.numbers import LEAST_CHANGE, at_the_least, off_numbers
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import Explanation
 from jaxsid.gap.verdict import Verdict
@@ -192,6 +192,11 @@ def about_numbers(found: Examination) -> list[str]:
             "The numbers of the nominal model are far from these records. Unless an effect does that, neither place "
             f"nor kind of what else it lacks is to be trusted.{told} Run identify first, and diagnose with the model "
             "that it writes."
+        )
+    if least := at_the_least(found.elements):
+        said.append(
+            f"As small as is tried, {1 + LEAST_CHANGE:.2g} times the nominal value: {', '.join(least)}. The records "
+            "may tell of less still, and the deviation of such a number says nothing."
         )
     return said
 
