@@ -75,7 +75,7 @@ def phi_functions(L: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Ar
 
 
 def less_identity_by_phi(L: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """e^L - I as L phi_1(L).
+    """e^L - I as L phi_1(L), of which rounding takes more the larger L: 1e-11 at norm 20, 2e-9 at 150.
 
     Args:
         L: square, of norm below 2^23.
