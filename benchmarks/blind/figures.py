@@ -64,7 +64,8 @@ def calibration(bins: list[dict[str, Any]], path: Path) -> None:
         axes.errorbar(x, y, yerr=error, fmt="none", color=INK, lw=0.8)
         axes.scatter(x, y, s=10 + 3 * n, color=INK)
         for a, b, count in zip(x, y, n, strict=True):
-            axes.annotate(str(count), (a, b), xytext=(6, -9), textcoords="offset points", fontsize=7)
+            inward = {"xytext": (-3, -19), "ha": "right"} if a > 0.9 else {"xytext": (6, -9), "ha": "left"}
+            axes.annotate(str(count), (a, b), textcoords="offset points", fontsize=7, **inward)
     axes.set(xlim=(0, 1.02), ylim=(0, 1.05), xlabel="probability said", ylabel="share that is right")
     figure.savefig(path)
     plt.close(figure)
