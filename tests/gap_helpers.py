@@ -36,20 +36,40 @@ def drive(samples=SAMPLES, seed=0, periods=1):
     return 10 * np.tile(u / u.std(), periods)
 
 
-def exact(u, kinds=SENSED, start=None):
-    """Readings of the linear chain by the matrix exponential."""
+def _sampled(kinds):
+    """The linear chain from one sample to the next, (6, 7), and what its sensors read of state and force."""
     plain = second_order(chain(kinds))
     M, D, K, B = (np.asarray(x) for x in (plain.mass, plain.damping, plain.stiffness, plain.input_matrix))
     A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
     force = np.concatenate([np.zeros((3, 1)), np.linalg.solve(M, B)])
     step = expm(np.block([[A, force], [np.zeros((1, 7))]]) * DT)
+
+    def read(x, push):
+        parts = {"displacement": x[:3], "velocity": x[3:], "acceleration": A[3:] @ x + force[3:, 0] * push}
+        return [parts[kind][body] for body, kind in kinds]
+
+    return step[:6], read
+
+
+def exact(u, kinds=SENSED, start=None):
+    """Readings of the linear chain by the matrix exponential."""
+    step, read = _sampled(kinds)
     x, y = np.zeros(6) if start is None else np.asarray(start, float), []
     for push in u:
-        a = A[3:] @ x + force[3:, 0] * push
-        parts = {"displacement": x[:3], "velocity": x[3:], "acceleration": a}
-        y.append([parts[kind][body] for body, kind in kinds])
-        x = step[:6, :6] @ x + step[:6, 6] * push
+        y.append(read(x, push))
+        x = step @ [*x, push]
     return np.array(y)
+
+
+def fed_back(u, noise, gain, kinds):
+    """Force and readings where the first reading, with its noise, is fed back; it has no feedthrough."""
+    step, read = _sampled(kinds)
+    x, pushes, y = np.zeros(6), [], []
+    for wanted, wrong in zip(u, noise, strict=True):
+        pushes.append(wanted - gain * (read(x, 0.0)[0] + wrong[0]))
+        y.append(read(x, pushes[-1]) + wrong)
+        x = step @ [*x, pushes[-1]]
+    return np.array(pushes), np.array(y)
 
 
 def with_effect(u, kind, place, parameters, kinds=SENSED):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gap_bench import known
-from gap_helpers import DT, chain, drive, exact, noisy, record
+from gap_helpers import DT, chain, drive, exact, fed_back, noisy, record
 from scipy.special import gammaincc
 
 from jaxsid.gap.noise import noise_of
@@ -64,6 +64,22 @@ def test_an_offset_as_large_as_the_noise_is_found(offset, found):
     fit = recalibrated(model, records, noise_of(model, records), wide=True)
     p = null_test(fit, places_of(model)).p_value
     assert p < 1e-6 if found else p > 0.01
+
+
+def test_noise_that_a_controller_feeds_back_is_no_law_of_inputs_or_sensors():
+    """What is left then goes by the inputs to come, but not by those before."""
+    model = chain(VELOCITIES)
+    size = 0.1 * exact(drive(), VELOCITIES).std(axis=0)
+    every = []
+    for seed in range(4):
+        noise = size * np.random.default_rng(seed).standard_normal((1024, 3))
+        records = [record(*fed_back(drive(seed=seed), noise, 20.0, VELOCITIES), VELOCITIES)]
+        fit = recalibrated(model, records, noise_of(model, records), wide=True)
+        tests = null_test(fit, places_of(model)).tests
+        every += [t.p_value for t in tests if "input" in t.name or "sensor s" in t.name]
+    # of four tests in four records
+    assert len(every) == 16
+    assert min(every) > 1e-3
 
 
 @pytest.mark.parametrize("told", [9, 2, 1])

@@ -101,11 +101,18 @@ def _of_motion(spectra: Spectra, pair: Array, most: Array, rms: Array, rate: Arr
 
 
 def _of_signal(spectra: Spectra, pair: Array, most: Array, rms: Array, rate: Array) -> Array:
+    """Of a sensor's ideal reading or an input; nothing follows what the signal has yet to do.
+
+    A controller feeds noise back, so that the inputs to come are made of what is left now, as those before are not.
+    """
     s = in_time(spectra, pair[:, :1])[:, 0]
-    jw = 1j * spectra.omega[:, None]
-    lagged = 1 / (1 + jw * jnp.asarray(LAGS, most.dtype) / rate) - 1
-    late = jnp.exp(-jw * jnp.asarray(LATE, most.dtype) / rate) - 1
-    moved = pair[:, :1] / rms[0] * jnp.concatenate([lagged, late, jw / rate], axis=1)
+    ago = jnp.exp(-1j * spectra.omega * spectra.dt)[:, None]
+    keeps = jnp.exp(-spectra.dt * rate / jnp.asarray(LAGS, most.dtype))
+    lagged = (1 - keeps) / (1 - keeps * ago) - 1
+    steps = jnp.asarray(LATE, most.dtype) / (rate * spectra.dt)
+    late = ago ** jnp.floor(steps) * (1 + (steps - jnp.floor(steps)) * (ago - 1)) - 1
+    change = (1 - ago) / (rate * spectra.dt)
+    moved = pair[:, :1] / rms[0] * jnp.concatenate([lagged, late, change], axis=1)
     both = jnp.concatenate([_hats(s, most[0]), jnp.zeros((len(s), HATS), s.dtype)], axis=1)
     known = jnp.concatenate([to_lines(spectra, both), moved], axis=1)
     return jnp.pad(known, ((0, 0), (0, MOST - known.shape[1])))

@@ -44,6 +44,8 @@ class Spectra(eqx.Module):
         free_states: (lines, 2 N, 2 N) likewise to the states.
         driven: (lines, outputs, inputs) from the held inputs.
         driven_states: (lines, 2 N, inputs) likewise to the states.
+        held: (lines, outputs, N) from forces on the bodies that keep their values between samples.
+        jumps: (inputs,) 1 for inputs that do.
         linear: M, D, K, where forces act and what sensors read.
         inverse_mass: (N, N).
         flexibility: (N, N) pseudo-inverse of the stiffness.
@@ -62,6 +64,8 @@ class Spectra(eqx.Module):
     free_states: Complex[Array, "lines n n"]
     driven: Complex[Array, "lines outputs inputs"]
     driven_states: Complex[Array, "lines n inputs"]
+    held: Complex[Array, "lines outputs N"]
+    jumps: Float[Array, " inputs"]
     linear: SecondOrderModel
     inverse_mass: Float[Array, "N N"]
     flexibility: Float[Array, "N N"]
@@ -123,6 +127,8 @@ class _Sampled(NamedTuple):
     linear: SecondOrderModel
     plain: ContinuousModel
     states: Realization
+    held: Realization
+    jumps: Array
     inverse_mass: Array
     flexibility: Array
     poles: Array
@@ -132,24 +138,26 @@ class _Sampled(NamedTuple):
 def _sampled_model(model: LumpedModel, dt: Array, hold: tuple[str, ...]) -> _Sampled:
     linear = second_order(model)
     size = len(linear.mass)
-    plain, states = _driven(linear, jnp.asarray(dt), tuple("zero" if h == "band" else h for h in hold))
+    plain, states, held = _driven(linear, jnp.asarray(dt), tuple("zero" if h == "band" else h for h in hold))
+    jumps = jnp.asarray([float(h == "zero") for h in hold])
     poles = jnp.asarray(np.linalg.eigvals(np.asarray(states.A)))
     flexibility = jnp.asarray(np.linalg.pinv(np.asarray(linear.stiffness), rcond=FREE, hermitian=True))
-    return _Sampled(linear, plain, states, plain.B[size:], flexibility, poles, "band" in hold)
+    return _Sampled(linear, plain, states, held, jumps, plain.B[size:], flexibility, poles, "band" in hold)
 
 
 @compiled
 def _driven(
     linear: SecondOrderModel, dt: Array, hold: tuple[str, ...]
-) -> tuple[ContinuousModel, Realization]:
-    """Driven at every body, and the states driven by the inputs."""
+) -> tuple[ContinuousModel, Realization, Realization]:
+    """Driven at every body, the states driven by the inputs, and by held forces on every body."""
     size, dtype = len(linear.mass), linear.mass.dtype
     every = eqx.tree_at(lambda s: s.input_matrix, linear, jnp.eye(size, dtype=dtype))
     plain = physical_displacement_velocity(every)
     eye = jnp.eye(2 * size, dtype=dtype)
     driven = plain.B @ linear.input_matrix
     # the states as outputs turn a first-order hold's shifted state into the plain one
-    return plain, discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=hold)
+    states = discretise(ContinuousModel(plain.A, driven, eye, jnp.zeros_like(driven)), dt, hold=hold)
+    return plain, states, discretise(ContinuousModel(plain.A, plain.B, eye, jnp.zeros_like(plain.B)), dt)
 
 
 @compiled_in_full
@@ -181,6 +189,8 @@ def _spectra(u: Array, y: Array, present: Array, model: _Sampled) -> Spectra:
         free_states,
         plain.C @ driven_states + plain.D @ inputs,
         driven_states,
+        plain.C @ (shifted @ model.held.B) + plain.D,
+        model.jumps,
         model.linear,
         model.inverse_mass,
         model.flexibility,
@@ -263,14 +273,21 @@ def parameter_columns(
 ) -> Complex[Array, "lines outputs e"]:
     """What unit changes of elements of M, D, K do to the outputs, on a given motion.
 
-    Exact where the motion is the true one: dM q'' + dD q' + dK q acts as a force against the bodies.
+    Exact where the motion is the true one: dM q'' + dD q' + dK q acts as a force against the bodies. Of that the part
+    dM M^-1 u jumps where a held input does, and between its values no straight band would lead: it would respond to
+    inputs that are still to come, which a controller makes of the noise that is there now.
 
     Args:
         spectra: of the record.
         motion: of the bodies.
         directions: (e, N, N) each, of M, D, K.
     """
-    return jnp.einsum("lpf,lfe->lpe", spectra.forced, parameter_forces(motion, directions))
+    linear = spectra.linear
+    pushed = (spectra.u * spectra.jumps) @ (spectra.inverse_mass @ linear.input_matrix).T
+    jumping = -jnp.einsum("efk,lk->lfe", directions[0], pushed)
+    smooth = parameter_forces(motion, directions) - jumping
+    every = jnp.concatenate([spectra.forced, spectra.held], axis=2)
+    return jnp.einsum("lpf,lfe->lpe", every, jnp.concatenate([smooth, jumping], axis=1))
 
 
 def parameter_forces(motion: Motion, directions: tuple[Array, Array, Array]) -> Complex[Array, "lines N e"]:
