@@ -184,7 +184,7 @@ def test_what_is_left_before_is_noise_sample_by_sample():
     cut = bench(y, level)
     blocks = blocks_of(chain(), [data], [known(absent)], cut.blocks[0].y.shape[1] - cut.blocks[0].lead)
     cut = cut._replace(blocks=blocks, states=tuple(np.zeros((len(b.y), 6)) for b in blocks))
-    (left,) = left_before(refitted(cut, Hypothesis()), cut)
+    (left,) = left_before(refitted(cut, Hypothesis()), cut).left
     first = untold(SAMPLES)
     assert np.isfinite(left[first:SAMPLES, :2]).all()
     assert np.isnan(left[:first]).all()

@@ -250,6 +250,7 @@ def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypa
 
     patches = {
         "loudest": lambda bench, without: bench,
+        "alone": lambda part, without: refit(-1e9),
         "roughly": lambda part, every, without, tried, say: [
             (c, refit(-10.0 * i)) for i, (c, *_) in enumerate(every)
         ],
@@ -425,3 +426,11 @@ def test_a_law_elsewhere_is_taken_unless_the_motion_grows_without_bound(monkeypa
     )
     found = search._elsewhere(at, origin, (), BENCH.model, (), silent)
     assert found.rounds[0] is (anew if last == 0.0 else once)
+
+
+def test_a_part_that_tells_of_no_candidate_leaves_them_as_they_were_screened():
+    screened = [candidate(kind, B12) for kind in ("hysteresis", "backlash", "cubic_stiffness")]
+    rough = [(screened[i], refit(e)) for i, e in ((2, -5.0), (1, -6.0), (0, -20.0))]
+    assert explain._promising(rough, screened, -4.9, BENCH) == [2, 1, 0]
+    assert explain._promising(rough, screened, -5.1, BENCH) == [0, 1, 2]
+    assert explain._promising([], screened, 0.0, BENCH) == []

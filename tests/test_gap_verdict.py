@@ -28,7 +28,7 @@ from jaxsid.gap.verdict import (
     concluded,
     verdict_of,
 )
-from jaxsid.gap.words import about_doubt
+from jaxsid.gap.words import about_doubt, about_held_out
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.effects.kind import Motion
 
@@ -44,7 +44,7 @@ def closure(after, recalibrated=0.3, floor=0.01, before=0.4):
     return Closure(before, recalibrated, after, floor, *ends, {}, {})
 
 
-def causes(*rounds, closures):
+def causes(*rounds, closures, seen=None):
     chosen = [r.ranked[0] for r in rounds][: len(closures)]
     last = chosen[-1].refit
     nothing = Left((), ())
@@ -53,7 +53,20 @@ def causes(*rounds, closures):
     ends = nothing, Left((np.ones((1, 1)),), ())
     best = refit(0.0)
     return Causes(
-        rounds, last, tuple(chosen), last, best, tuple(closures), lefts, linear, (), None, None, ends, ()
+        rounds,
+        last,
+        tuple(chosen),
+        last,
+        best,
+        tuple(closures),
+        lefts,
+        seen,
+        linear,
+        (),
+        None,
+        None,
+        ends,
+        (),
     )
 
 
@@ -129,6 +142,24 @@ def test_a_law_near_enough_stands_though_tests_are_sure_that_it_is_not_exact():
     verdict = verdict_of(examination(), found)
     assert verdict.name == "effect"
     assert verdict.probability["unknown"] < 0.35
+
+
+def test_where_held_out_samples_do_not_show_the_gap_those_seen_tell():
+    """A sweep ends where the law does nothing: noise is all that any model leaves of its end."""
+    end, clear = closure(0.0978, 0.1234, 0.0969, 0.0978), closure(0.052, 0.43, 0.0515, 1.09)
+    found = causes(ranking(0.0, -200.0), closures=[end], seen=clear)
+    assert verdict_of(examination(), found).probability["effect"] == pytest.approx(1 - LAPSE, abs=5e-3)
+    (said,) = about_held_out(found)
+    assert "leaves 9.8 % of them, noise 9.7 %" in said
+    assert "left 110 % by the nominal model and 5.2 % with" in said
+    # what explains half of the gap there is none, nor what explains half of one that held-out samples do show
+    loud = closure(0.55, 0.43, 0.0515, 1.09)
+    assert verdict_of(examination(), found._replace(seen=loud)).name == "unknown"
+    half = causes(ranking(0.0, -200.0), closures=[closure(0.15, 0.3, 0.0969, 0.3)], seen=clear)
+    assert verdict_of(examination(), half).name == "unknown"
+    assert about_held_out(half) == about_held_out(None) == []
+    # where nothing was found there is nothing to be shown
+    assert found._replace(selected=()).telling is end
 
 
 @pytest.mark.parametrize(

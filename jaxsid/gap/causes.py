@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsid.gap.any_law import any_law, smooth_places
 from jaxsid.gap.closely import motions_to_begin
-from jaxsid.gap.closure import Closure, Left, closure_of, left_of
+from jaxsid.gap.closure import Closure, Left, closure_of, left_before, left_of, shown
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, later_than_effects, later_than_linear
@@ -38,6 +38,7 @@ class Causes(NamedTuple):
         closures: of every selected effect together with those before it, on held-out samples; of the model within
             its tolerance where none was selected.
         lefts: what each of these leaves of these samples.
+        seen: how far the gap shrinks with all of them on the samples that they were fitted to, window by window.
         linear: how far the gap shrinks with the best linear model alone.
         before: what the nominal model and the best linear one leave of these samples.
         later: how many samples of each record must be seen for all that it holds; as many as were where what was
@@ -56,6 +57,7 @@ class Causes(NamedTuple):
     recalibrated: Refit
     closures: tuple[Closure, ...]
     lefts: tuple[Left, ...]
+    seen: Closure
     linear: Closure
     noises: tuple[Noise, ...]
     remaining: Null
@@ -68,6 +70,11 @@ class Causes(NamedTuple):
     def bounded(self) -> bool:
         """Whether the noise is guessed and tests find more than noise in what is left: it is no more than that."""
         return self.places is not None and any(n.degrees <= 0 for n in self.noises)
+
+    @property
+    def telling(self) -> Closure:
+        """The last one on held-out samples, or where those do not show the gap on the samples seen."""
+        return self.closures[-1] if not self.selected or shown(self.closures[-1]) else self.seen
 
     @property
     def most(self) -> str:
@@ -119,42 +126,80 @@ def causes_of(
     unlisted = _unlisted(bench, look, selected, say) if _doubted(found, look, selected) else ()
     say("how far the gap shrinks")
     ends = tuple(len(r.y) for r in seen)
-    motions = motions_to_begin(bench, whole, found.noises, found.scored)
-    windowed = is_free_or_unstable(model) or motions is not None
-    lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=windowed, motions=motions)
-    frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
-    before = lefts(refitted(frozen, Hypothesis())), lefts(linear)
-    steps = [lefts(x.refit) for x in selected] or [lefts(chosen)]
-    names = [s.name for s in model.sensors]
-    # what is left is noise where tests find nothing in it, else more than that
-    less = partial(quieter, found=found_part(look.null, look.fit))
-    told = bench.noises if look.clear else tuple(map(less, found.noises, bench.noises))
-    # windows of a few samples take up noise themselves
-    refuted = REFUTED if motions is None else 0.0
-    floor = tuple(no_louder(n, x, refuted) for n, x in zip(told, steps[-1].left, strict=True))
-    *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
-    if motions is not None:
+    tried = _Tried(found, bench, look, linear, chosen, [x.refit for x in selected])
+    gone = _shrunk(tried, whole, ends)
+    if gone.followed:
         later = ends  # no run tells what comes later
     elif selected:
-        later = later_than_effects(chosen, bench, whole, ends, each[-1])
+        later = later_than_effects(chosen, bench, whole, ends, gone.closures[-1])
     else:
-        later = later_than_linear(found, linear, bench, whole, ends, before[1])
+        later = later_than_linear(found, linear, bench, whole, ends, gone.before[1])
     return Causes(
         rounds,
         chosen,
         tuple(selected),
         plain,
         linear,
-        tuple(each),
-        tuple(steps),
-        alone,
-        floor,
+        gone.closures,
+        gone.lefts,
+        gone.seen,
+        gone.linear,
+        gone.noises,
         look.null,
         None if look.clear else look.scored,
-        before,
+        gone.before,
         later,
         unlisted,
     )
+
+
+class _Tried(NamedTuple):
+    """What was looked at, with which records, and the fits whose closures are asked for."""
+
+    found: Examination
+    bench: Bench
+    look: Look
+    linear: Refit
+    chosen: Refit
+    steps: list[Refit]
+
+
+class _Shrunk(NamedTuple):
+    """Fields of `Causes`, and whether windows of a few samples follow the records."""
+
+    closures: tuple[Closure, ...]
+    lefts: tuple[Left, ...]
+    seen: Closure
+    linear: Closure
+    noises: tuple[Noise, ...]
+    before: tuple[Left, Left]
+    followed: bool
+
+
+def _shrunk(tried: _Tried, whole: Sequence[Record], ends: tuple[int, ...]) -> _Shrunk:
+    """How far the gap shrinks on samples that were not seen, and on those that were."""
+    found, bench, look = tried.found, tried.bench, tried.look
+    motions = motions_to_begin(bench, whole, found.noises, found.scored)
+    windowed = is_free_or_unstable(bench.model) or motions is not None
+    lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=windowed, motions=motions)
+    nominal = refitted(
+        bench._replace(tolerance=np.full_like(bench.tolerance, FIXED)),
+        Hypothesis(),
+    )
+    before = lefts(nominal), lefts(tried.linear)
+    steps = tuple(map(lefts, tried.steps or [tried.chosen]))
+    # what is left is noise where tests find nothing in it, else more than that
+    less = partial(quieter, found=found_part(look.null, look.fit))
+    told = bench.noises if look.clear else tuple(map(less, found.noises, bench.noises))
+    # windows of a few samples take up noise themselves
+    refuted = REFUTED if motions is None else 0.0
+    floor = tuple(no_louder(n, x, refuted) for n, x in zip(told, steps[-1].left, strict=True))
+    names = [s.name for s in bench.model.sensors]
+    *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
+    first, straight, after = (left_before(x, bench) for x in (nominal, tried.linear, tried.chosen))
+    least = [no_louder(n, x, refuted) for n, x in zip(told, after.left, strict=True)]
+    same = closure_of(first, straight, after, least, names)
+    return _Shrunk(tuple(each), steps, same, alone, floor, before, motions is not None)
 
 
 def _doubted(found: Examination, look: Look, selected: Sequence[Explanation]) -> bool:

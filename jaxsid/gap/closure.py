@@ -22,6 +22,7 @@ PIECES = 40  # that what is left is cut into for the interval
 DRAWS = 2000  # of pieces
 ROUNDS = 8  # of the search for initial states
 CLEAR = 1.5  # a gap over the noise floor from which on more than noise is left
+SHOWN = 0.25  # power of a gap next to that of noise, from which on samples show it
 
 
 class Left(NamedTuple):
@@ -87,6 +88,17 @@ def substantial(gap: float, floor: float) -> bool:
     return gap > CLEAR * floor
 
 
+def shown(closure: Closure) -> bool:
+    """Whether held-out samples show the nominal model's gap at all, so that they can tell how much of it is gone.
+
+    A sweep may end where a law does nothing, or noise may be louder than what it does there.
+
+    Args:
+        closure: on those samples.
+    """
+    return closure.before**2 > (1 + SHOWN) * closure.noise_floor**2
+
+
 @step
 def left_of(
     found: Refit,
@@ -132,18 +144,21 @@ def left_of(
     return Left(tuple(left), tuple(measured), windows)
 
 
-def left_before(found: Refit, bench: Bench) -> tuple[Float[np.ndarray, "..."], ...]:
-    """(samples, outputs) of every record, what a model leaves in the windows that it was fitted to.
+def left_before(found: Refit, bench: Bench) -> Left:
+    """Likewise of the samples that a model was fitted to, window by window.
 
     Args:
         found: model.
         bench: that it was fitted to.
     """
-    parts: list[list[np.ndarray]] = [[] for _ in range(bench.records)]
+    left: list[list[np.ndarray]] = [[] for _ in range(bench.records)]
+    measured: list[list[np.ndarray]] = [[] for _ in range(bench.records)]
     for b, x in zip(bench.blocks, _left(found, bench, bench.blocks, found.fit.states), strict=True):
-        there = _judged(b, b.weight) > 0
-        parts[int(b.record[0])].append(np.where(there, _judged(b, x), np.nan))
-    return tuple(np.concatenate(own) for own in parts)
+        mask = np.where(_judged(b, b.weight) > 0, 0.0, np.nan)
+        left[int(b.record[0])].append(_judged(b, x) + mask)
+        measured[int(b.record[0])].append(_judged(b, b.y) + mask)
+    windows = tuple(_length(bench) * m.dt for m in bench.moved)
+    return Left(tuple(map(np.concatenate, left)), tuple(map(np.concatenate, measured)), windows)
 
 
 def _length(bench: Bench) -> int:

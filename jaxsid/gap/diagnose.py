@@ -20,7 +20,15 @@ from jaxsid.gap.noise import SOURCES
 from jaxsid.gap.ranking import ERRORS, Explanation, Key, Ranking, alike, key_of
 from jaxsid.gap.refit import Refit
 from jaxsid.gap.verdict import Verdict, as_pair, concluded, plain_place
-from jaxsid.gap.words import about_doubt, about_inputs, about_numbers, next_experiment, remaining, summary
+from jaxsid.gap.words import (
+    about_doubt,
+    about_held_out,
+    about_inputs,
+    about_numbers,
+    next_experiment,
+    remaining,
+    summary,
+)
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
@@ -326,7 +334,7 @@ def _warnings(
     verdict: Verdict,
     rest: bool,
 ) -> tuple[str, ...]:
-    said = about_doubt(causes, verdict)
+    said = about_doubt(causes, verdict) + about_held_out(causes)
     if model.effects:
         kinds = ", ".join(x.kind for x in model.effects)
         said.append(f"The model's effects ({kinds}) were left out: the gap is that of its linear part.")

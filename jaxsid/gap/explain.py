@@ -45,7 +45,7 @@ from jaxsid.gap.refit import (
     tied,
     weighed_anew,
 )
-from jaxsid.gap.roughly import FINE, label, loudest, roughly, start_from
+from jaxsid.gap.roughly import FINE, alone, label, loudest, roughly, start_from
 from jaxsid.gap.screen import Candidate
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.parallel import side_by_side
@@ -327,7 +327,8 @@ def _round(
 
     close = [(top - value(r, bench)) / scale / effort.temperature < effort.behind for _, r in rough]
     most = effort.refined + len(done)
-    best = range(min(most, len(rough)))
+    nothing = value(alone(part, without), part) if rough and known is None else -math.inf
+    best = _promising(rough, [c for c, *_ in every], nothing, bench)[:most]
     due = [i for i in best if i not in done and (close[i] or (i == 0 and known is None))]
     done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     near = CLOSE * scale * effort.temperature
@@ -338,6 +339,20 @@ def _round(
             break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     return nested(_compared(rough, values, done, bench, without, effort), effort.steps, say)
+
+
+def _promising(
+    rough: Sequence[tuple[Candidate, Refit]], screened: Sequence[Candidate], nothing: float, bench: Bench
+) -> list[int]:
+    """Numbers of rough fits, best first; as they were screened where none is better than nothing at all.
+
+    A part of the records that tells of none of them is no judge: all lines together, that were screened, tell more.
+    """
+    order = list(range(len(rough)))
+    if not rough or value(rough[0][1], bench) > nothing:
+        return order
+    first = [key_of(c.kind, c.place) for c in screened]
+    return sorted(order, key=lambda i: first.index(key_of(rough[i][0].kind, rough[i][0].place)))
 
 
 def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: Effort) -> Whole:

@@ -71,7 +71,7 @@ def later_than_linear(
     """
     # a model that drifts away leaves most where nothing else is the matter
     windowed = is_free_or_unstable(bench.model)
-    before = left_before(linear, bench) if windowed else [x.refit - x.measured for x in found.beside]
+    before = left_before(linear, bench).left if windowed else [x.refit - x.measured for x in found.beside]
     return later_ends(whole, ends, before, after.left)
 
 
@@ -90,4 +90,4 @@ def later_than_effects(
     if not substantial(closure.after, closure.noise_floor):
         return ends
     after = left_of(chosen, bench, whole, ends, windowed=True)
-    return later_ends(whole, ends, left_before(chosen, bench), after.left)
+    return later_ends(whole, ends, left_before(chosen, bench).left, after.left)

@@ -35,15 +35,21 @@ def loudest(bench: Bench, found: Refit) -> Bench:
         found: the fit.
     """
 
-    def left_alone(part: Bench) -> float:
-        begin = {"changes": changes_of(found, part), "steps": FEW, "gain": FINE}
-        return refitted(part, found.hypothesis, **begin).fit.squares
-
     each = zip(bench.blocks, bench.states, strict=True)
     parts = [bench._replace(blocks=(b,), states=(x,)) for b, x in each]
-    left = np.array(side_by_side(left_alone, parts))
+    left = np.array(side_by_side(lambda part: alone(part, found).fit.squares, parts))
     signal = [((np.asarray(b.y) * np.asarray(b.weight))[:, b.lead :] ** 2).sum() for b in bench.blocks]
     return parts[int(np.argmax(np.where(left >= ALIKE * left.max(), signal, -1.0)))]
+
+
+def alone(part: Bench, found: Refit) -> Refit:
+    """What was found, fitted to a part of the records alone.
+
+    Args:
+        part: of the records.
+        found: the fit.
+    """
+    return refitted(part, found.hypothesis, changes=changes_of(found, part), steps=FEW, gain=FINE)
 
 
 def roughly(

@@ -100,7 +100,7 @@ def _unexplained(causes: Causes, finding: str) -> float:
     Beside the best linear model only where tests find more than it explains: what that leaves of other samples, near a
     resonance of which those seen tell little, is its own error.
     """
-    last = causes.closures[-1]
+    last = causes.telling
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1 - MISSED
     # what comes nearest to a law that is not there explains most of its gap, but not to the noise

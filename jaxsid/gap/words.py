@@ -163,11 +163,29 @@ def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
         return [
             f"{doubt} two laws at one place, {both} {where}, may stand for a single one of another shape."
         ]
-    closure = causes.closures[-1]
+    closure = causes.telling
+    those = "that were not used" if closure is causes.closures[-1] else "used"
     return [
-        f"{doubt} what was found leaves {percent(closure.after)} on samples that were not used, where the best "
-        f"linear model leaves {percent(closure.recalibrated)} and noise alone {causes.most}"
+        f"{doubt} what was found leaves {percent(closure.after)} on samples {those}, where the best linear "
+        f"model leaves {percent(closure.recalibrated)} and noise alone {causes.most}"
         f"{percent(closure.noise_floor)}."
+    ]
+
+
+def about_held_out(causes: Causes | None) -> list[str]:
+    """That samples which were not used do not show the gap, and how far it shrinks on those that do.
+
+    Args:
+        causes: what was found.
+    """
+    if causes is None or causes.telling is causes.closures[-1]:
+        return []
+    left, seen = causes.closures[-1], causes.seen
+    return [
+        f"The samples that were not used hardly show the gap: the nominal model leaves {percent(left.before)} of them, "
+        f"noise {causes.most}{percent(left.noise_floor)}. So they do not prove what was found. Of those used, windows "
+        f"that begin anew are left {percent(seen.before)} by the nominal model and {percent(seen.after)} with what was "
+        "found. Measure again with the motion of these at the end, too."
     ]
 
 
