@@ -37,7 +37,8 @@ class Truth:
         self._linear_changes()
         self.inverse = np.linalg.inv(self.M)
         self.W = self.e @ self.inverse @ self.e
-        extra = {"missing_mode": 2, "hysteresis": 1, "sensor_lag": 1, "actuator_lag": 1}.get(kind, 0)
+        self.gives = kind == "stribeck_friction" and "stiffness" in parameters
+        extra = {"missing_mode": 2, "hysteresis": 1, "sensor_lag": 1, "actuator_lag": 1}.get(kind, self.gives)
         self.x = np.zeros(2 * self.N + extra)
 
     def _linear_changes(self):
@@ -85,7 +86,7 @@ class Truth:
         if kind == "end_stop":
             b = p["clearance"]
             return p["stiffness"] * (d - b if d > b else d + b if d < -b else 0.0)
-        if kind == "hysteresis":
+        if kind == "hysteresis" or self.gives:
             return p["stiffness"] * x[2 * N]
         if kind == "cogging_ripple":
             return p["amplitude"] * np.sin(p["wavenumber"] * d + p["phase"])
@@ -117,6 +118,9 @@ class Truth:
         if kind == "hysteresis":
             z, w, n = x[2 * N], self.e @ v, p["exponent"]
             extra[0] = w - p["beta"] * abs(w) * abs(z) ** (n - 1) * z - p["gamma"] * w * abs(z) ** n
+        if self.gives:
+            w = self.e @ v
+            extra[0] = w - p["stiffness"] * abs(w) * x[2 * N] / self.level(w)
         a = self.inverse @ f
         if kind == "sensor_lag":
             extra[0] = (self.ideal(x, a)[self.place] - x[2 * N]) / p["time_constant"]
@@ -152,7 +156,7 @@ class Truth:
         if end - t < 1e-12:
             return
         options = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-14, "first_step": end - t}
-        if "friction" not in self.kind:
+        if "friction" not in self.kind or self.gives:
             self.x = solve_ivp(self.derivative, (t, end), self.x, args=(k, None), **options).y[:, -1]
             return
         while end - t > 1e-12:
@@ -190,7 +194,7 @@ class Truth:
 
     def readings(self, t, k):
         way = self.way
-        if "friction" in self.kind and not way:
+        if "friction" in self.kind and not self.gives and not way:
             way = self.decide(t, self.x, k)
         y = self.ideal(self.x, self.derivative(t, self.x, k, way)[self.N : 2 * self.N])
         if self.kind == "sensor_lag":

@@ -366,6 +366,13 @@ def test_effects_are_listed_and_told_one_by_one(tmp_path):
     )
     (effect,) = read_model(model).effects
     assert effect.kind == "coulomb_friction"
+    # a form of a kind has a parameter more, which may be given too
+    text = call("effects", "stribeck_friction").output
+    assert "Canudas de Wit, H. Olsson" in text
+    lines = text[text.index("[[effects]]") :].replace('"body"', '"b1"').replace("# stiffness", "stiffness")
+    model.write_text(model.read_text().split("[[effects]]")[0] + lines)
+    (effect,) = read_model(model).effects
+    assert (effect.kind, float(effect.parameters["stiffness"])) == ("stribeck_friction", 1.0)
     unknown = call("effects", "backlsh")
     assert unknown.exit_code == 2
     assert "did you mean 'backlash'" in unknown.output

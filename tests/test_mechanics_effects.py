@@ -18,6 +18,7 @@ SENSED = ((0, "acceleration"), (1, "displacement"), (2, "velocity"))
 MASS, STIFFNESS, DAMPING = [1.0, 1.2, 0.8], [2000.0, 1500.0, 1000.0], [8.0, 6.0, 5.0]
 # effects of 5 to 60 % of the response: kind, place, parameters, worst relative rms error
 JOINT, WALL = (0, 1), (GROUND, 0)
+GIVING = {"force": 2.0, "static_force": 3.0, "velocity": 0.1, "stiffness": 3000.0}
 CASES = [
     ("mass_error", 1, {"factor": 1.3}, 1e-9),
     ("stiffness_error", JOINT, {"factor": 0.7}, 1e-9),
@@ -29,6 +30,7 @@ CASES = [
     ("coulomb_friction", JOINT, {"force": 2.0}, 1e-3),
     ("coulomb_friction", JOINT, {"force": 12.0}, 1e-3),
     ("stribeck_friction", WALL, {"force": 2.0, "static_force": 3.0, "velocity": 0.1}, 1e-3),
+    ("stribeck_friction", JOINT, GIVING, 1e-4),
     ("quadratic_damping", JOINT, {"coefficient": 15.0}, 1e-4),
     ("cubic_stiffness", JOINT, {"coefficient": 3e6}, 1e-4),
     ("quadratic_stiffness", JOINT, {"coefficient": 3e4}, 1e-4),

@@ -29,7 +29,7 @@ from jaxsid.gap.words import (
     remaining,
     summary,
 )
-from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.catalogue import law_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.units import units_of
@@ -205,8 +205,9 @@ class Diagnosis(NamedTuple):
         row = where.index(x.key)
         turning = units_of(self.nominal).turning
         found = {}
-        for p in CATALOGUE[x.kind].parameters:
-            value = np.ravel(np.asarray(refit.hypothesis.effects[row].parameters[p.name], float))
+        effect = refit.hypothesis.effects[row]
+        for p in law_of(effect.kind, effect.parameters).parameters:
+            value = np.ravel(np.asarray(effect.parameters[p.name], float))
             unit = " or ".join(dict.fromkeys(p.unit)) if turning is None else p.unit[int(turning)]
             said = float(value[0]) if value.size == 1 else value.tolist()
             found[p.name] = {"value": said, "std": refit.deviations[row][p.name], "unit": unit}

@@ -47,6 +47,7 @@ from jaxsid.gap.refit import (
 )
 from jaxsid.gap.roughly import FINE, alone, label, loudest, roughly, start_from
 from jaxsid.gap.screen import Candidate
+from jaxsid.gap.sliding import sliding
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.parallel import side_by_side
 from jaxsid.physical.elements import Element, element_matrices
@@ -338,7 +339,8 @@ def _round(
             values = [x if i in done else min(x, top - near) for i, x in enumerate(values)]
             break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
-    return nested(_compared(rough, values, done, bench, without, effort), effort.steps, say)
+    compared = _compared(rough, values, done, bench, without, effort)
+    return sliding(nested(compared, effort.steps, say), say)
 
 
 def _promising(

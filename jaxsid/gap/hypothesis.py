@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsid.mechanics.amplitudes import amplitudes
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS, by_sort, kind_number
+from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, by_sort, kind_number, law_of
 from jaxsid.mechanics.effects.prior import Amplitudes, Prior
 from jaxsid.mechanics.lumped import Effect, LumpedModel, with_effects
 from jaxsid.mechanics.slots import Slots, slots_of
@@ -161,7 +161,7 @@ def coordinates_of(effects: Sequence[Effect], at: Amplitudes) -> Coordinates:
     table["raised"][:], table["deviation"][:], table["lowest"][:] = -1, FIXED, -np.inf
     table["centre"][len(effects) :, 0] = 1.0
     for row, effect in enumerate(effects):
-        parameters = CATALOGUE[effect.kind].parameters
+        parameters = law_of(effect.kind, effect.parameters).parameters
         names = [p.name for p in parameters]
         own = Amplitudes(*(np.asarray(x)[row] for x in at))
         for i, p in enumerate(parameters):
@@ -197,7 +197,7 @@ def parameter_rows(effects: Sequence[Effect]) -> Float[np.ndarray, "slots most"]
     found = np.zeros((max(len(effects), 1), MOST_PARAMETERS))
     found[len(effects) :, 0] = 1.0
     for row, effect in enumerate(effects):
-        for i, p in enumerate(CATALOGUE[effect.kind].parameters):
+        for i, p in enumerate(law_of(effect.kind, effect.parameters).parameters):
             found[row, i] = np.ravel(np.asarray(effect.parameters.get(p.name, p.default), float))[0]
     return found
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsid.gap.refit import Bench, Refit, as_guessed
 from jaxsid.gap.screen import Candidate
-from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, law_of
 from jaxsid.mechanics.lumped import GROUND
 
 WORTH = 6.0  # tempered gain of evidence from which on effects are taken
@@ -195,7 +195,7 @@ def sensible(found: Refit, bench: Bench) -> bool:
     """
     block = bench.blocks[0] if bench.blocks else None
     for effect in found.hypothesis.effects:
-        kind = CATALOGUE[effect.kind]
+        kind = law_of(effect.kind, effect.parameters)
         values = {p.name: float(np.ravel(np.asarray(effect.parameters[p.name]))[0]) for p in kind.parameters}
         if kind.sensible is not None and not kind.sensible(*values.values()):
             return False

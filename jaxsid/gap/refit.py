@@ -27,7 +27,7 @@ from jaxsid.gap.setting import LARGE, element_directions, slowest_rate
 from jaxsid.gap.shooting import Products, Shot, products_of, told_parameters
 from jaxsid.gap.spectra import in_time
 from jaxsid.gap.windows import SHORTEST, Block, blocks_of, window_length
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, sort_of
+from jaxsid.mechanics.effects.catalogue import law_of, sort_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import Effect, LumpedModel, free_bodies, second_order, with_effects
 from jaxsid.mechanics.simulate import ordered_inputs
@@ -119,7 +119,7 @@ class Hypothesis(NamedTuple):
     @property
     def linear(self) -> bool:
         """Whether no effect is more than a change of the linear model or of what enters and leaves it."""
-        return all(sort_of(CATALOGUE[e.kind]) == "linear" for e in self.effects)
+        return all(sort_of(law_of(e.kind, e.parameters)) == "linear" for e in self.effects)
 
 
 class Refit(NamedTuple):
@@ -478,7 +478,7 @@ def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Re
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(rows.shape)
     found, deviations = [], []
     for row, effect in enumerate(effects):
-        names = [p.name for p in CATALOGUE[effect.kind].parameters]
+        names = [p.name for p in law_of(effect.kind, effect.parameters).parameters]
         own = np.asarray(shot.coordinates.per_record)[row]
         values = {
             n: every[:, row, i] if own[i] and bench.records > 1 else float(rows[row, i])

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsid.mechanics.augmented import augmented
 from jaxsid.mechanics.dry_friction import friction, holding
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, Sorted, slips, sort_of
+from jaxsid.mechanics.effects.catalogue import LAWS, Sorted, slips, sort_of
 from jaxsid.mechanics.effects.kind import Kind, Motion
 from jaxsid.mechanics.functions_of_matrices import less_identity_by_squaring
 from jaxsid.mechanics.held_input import parabola_over_step, value_at_sample
@@ -374,9 +374,9 @@ def _slope_of(kind: Kind) -> Callable[..., tuple[Array, Array]]:
     return found
 
 
-LAWS = [number for number, kind in enumerate(CATALOGUE.values()) if sort_of(kind) == "law"]
-BRANCH = np.searchsorted(LAWS, np.arange(len(CATALOGUE)))  # of each kind that is a law
-BRANCHES = [_slope_of(list(CATALOGUE.values())[number]) for number in LAWS]
+NUMBERS = [number for number, kind in enumerate(LAWS.values()) if sort_of(kind) == "law"]
+BRANCH = np.searchsorted(NUMBERS, np.arange(len(LAWS)))  # of each kind that is a law
+BRANCHES = [_slope_of(list(LAWS.values())[number]) for number in NUMBERS]
 
 
 def _ports(march: _March, seen: Array, time: Array) -> Array:

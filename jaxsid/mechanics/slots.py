@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, Numbers, kind_number, parameter_row
+from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, Numbers, kind_number, law_of, parameter_row
 from jaxsid.mechanics.effects.kind import Nominal
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel
 from jaxsid.records import SecondOrderModel, as_array
@@ -45,7 +45,8 @@ def slots_of(model: LumpedModel, record: int = 0) -> Slots:
         model: with any number of effects.
         record: number of the record, for parameters of which there is one a record.
     """
-    kinds = np.array([kind_number(e.kind) for e in model.effects], np.int32)
+    laws = [law_of(e.kind, e.parameters) for e in model.effects]
+    kinds = np.array([kind_number(law.name) for law in laws], np.int32)
     rows = [parameter_row(e.kind, e.parameters, record) for e in model.effects]
     parameters = jnp.stack(rows) if rows else jnp.zeros((0, MOST_PARAMETERS))
     sensors, inputs = [s.name for s in model.sensors], [i.name for i in model.inputs]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsid.checks import bad_input, require
-from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.catalogue import law_of
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.physical.elements import Element, LinearMatrices, element_matrices
 from jaxsid.physical.interior import Cone, positive_cone
@@ -227,7 +227,8 @@ def _natural_bounds(model: LumpedModel, every: LinearMatrices) -> tuple[np.ndarr
 
 def _lowest(model: LumpedModel, x: Element, size: float) -> float:
     if x.kind:
-        return next(p.lowest for p in CATALOGUE[x.kind].parameters if p.name == x.quantity.partition("[")[0])
+        name = x.quantity.partition("[")[0]
+        return next(p.lowest for p in law_of(x.kind, [name]).parameters if p.name == name)
     if model.matrices is not None and not _diagonal(x):
         return -np.inf
     return SMALLEST * abs(size) if x.quantity == "mass" else 0.0

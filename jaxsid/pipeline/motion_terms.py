@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxsid.checks import require
 from jaxsid.compilation import compiled
 from jaxsid.impulse.whitening import MOST
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, MOST_PARAMETERS, parameter_row
+from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, law_of, parameter_row
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.hold import discretise
 from jaxsid.mechanics.lumped import LumpedModel, free_bodies, second_order
@@ -138,7 +138,7 @@ def motion_term(model: LumpedModel, records: Sequence[Record], cut: Windows, *, 
 def _free_states(model: LumpedModel) -> list[int]:
     """Displacements, velocities, and the states that the effects have."""
     motion, slots = 2 * len(model.bodies), len(model.effects)
-    own = [CATALOGUE[e.kind].states for e in model.effects]
+    own = [law_of(e.kind, e.parameters).states for e in model.effects]
     firsts = [motion + i for i, count in enumerate(own) if count > 0]
     return [*range(motion), *firsts, *(motion + slots + i for i, count in enumerate(own) if count > 1)]
 
@@ -191,7 +191,7 @@ def parameter_table(model: LumpedModel, numbers: Sequence[int]) -> ParameterTabl
     shape = (len(numbers), len(model.effects), MOST_PARAMETERS)
     index, at = np.full(shape, -1), len(element_matrices(model).listed)
     for slot, effect in enumerate(model.effects):
-        names = [p.name for p in CATALOGUE[effect.kind].parameters]
+        names = [p.name for p in law_of(effect.kind, effect.parameters).parameters]
         for name, value in effect.parameters.items():
             size = np.size(np.asarray(value))
             index[:, slot, names.index(name)] = at + np.minimum(numbers, size - 1)

@@ -9,7 +9,7 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import elements_by_key
 from jaxsid.gap.ranking import key_of
 from jaxsid.gap.words import kind_words, named, place_words, windows_words
-from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.effects.catalogue import law_of
 from jaxsid.physical.elements import element_matrices
 from jaxsid.report.frame import Block, Card, Cell, Gallery, Picture, Section, Table, Text, picture
 from jaxsid.report.numbers import (
@@ -108,7 +108,7 @@ def _selected_row(x: dict[str, Any]) -> tuple[str | Cell, ...]:
     return (
         Cell(kind_words(x["kind"]), place_words(x["place"])),
         Cell(parameters_said(x["parameters"]), tone="wide"),
-        Cell(CATALOGUE[x["kind"]].law, tone="wide"),
+        Cell(law_of(x["kind"], x["parameters"]).law, tone="wide"),
         misfit(max(left)) if left else MISSING,
     )
 

@@ -4,7 +4,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, kind_named
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, forms_of, further_of, kind_named
 from jaxsid.mechanics.effects.kind import Kind, Parameter
 
 PLACES = {
@@ -30,8 +30,9 @@ def print_effects(console: Console | None = None) -> None:
     for name in ("kind", "place", "law", "parameters"):
         table.add_column(name, overflow="fold")
     for kind in CATALOGUE.values():
-        names = ", ".join(_told(p) for p in kind.parameters)
-        table.add_row(kind.name, kind.where, escape(kind.law), escape(names))
+        for law in (kind, *forms_of(kind.name)):
+            names = ", ".join(_told(p) for p in law.parameters)
+            table.add_row(kind.name, law.where, escape(law.law), escape(names))
     (console or Console()).print(table)
 
 
@@ -46,7 +47,17 @@ def print_effect(name: str, console: Console | None = None) -> None:
         InputError: no such kind.
     """
     kind, out = kind_named(name, f"effect '{name}'"), console or Console()
-    out.print(f"[bold]{kind.name}[/bold]: {escape(kind.law)}", highlight=False)
+    _print(kind, f"[bold]{kind.name}[/bold]", out)
+    for form in forms_of(name):
+        _print(form, f"\n[bold]{kind.name}[/bold] with [bold]{further_of(form)}[/bold]", out)
+    out.print(f"\nScales: {SYMBOLS}", highlight=False)
+    out.print("In a model file:\n", highlight=False)
+    further = [f"# {further_of(form)} = 1.0" for form in forms_of(name)]
+    out.print(escape("\n".join([model_lines(kind), *further])), highlight=False, soft_wrap=True)
+
+
+def _print(kind: Kind, name: str, out: Console) -> None:
+    out.print(f"{name}: {escape(kind.law)}", highlight=False)
     out.print(escape(kind.about), highlight=False)
     table = Table()
     for column in (
@@ -63,10 +74,7 @@ def print_effect(name: str, console: Console | None = None) -> None:
         default = "required" if p.default is None else f"{p.default:g}"
         table.add_row(p.name, escape(units_of(p)), lowest, default, scale_of(p), str(p.prior))
     out.print(table)
-    out.print(f"Scales: {SYMBOLS}", highlight=False)
     out.print(f"Source: {escape(kind.source)}", highlight=False)
-    out.print("In a model file:\n", highlight=False)
-    out.print(escape(model_lines(kind)), highlight=False, soft_wrap=True)
 
 
 def model_lines(kind: Kind) -> str:
@@ -76,7 +84,7 @@ def model_lines(kind: Kind) -> str:
         kind: one of the catalogue.
     """
     given = [p for p in kind.parameters if p.default is None] or list(kind.parameters[:1])
-    lines = ["[[effects]]", f'kind = "{kind.name}"', PLACES[kind.where]]
+    lines = ["[[effects]]", f'kind = "{kind.form_of or kind.name}"', PLACES[kind.where]]
     return "\n".join([*lines, *(f"{p.name} = {float(p.typical)}" for p in given)])
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from jaxsid.checks import InputError, require
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, kind_named
+from jaxsid.mechanics.effects.catalogue import CATALOGUE, forms_of, further_of, kind_named
 from jaxsid.mechanics.effects.kind import Kind, Parameter
 from jaxsid.report.effects import SYMBOLS, model_lines, scale_of, units_of
 from jaxsid.report.plots.effects import effect_figure
@@ -81,7 +81,7 @@ def write_picture(name: str, file: Path) -> None:
 
 def _section(kind: Kind) -> str:
     lines = [
-        f"## {kind.name}",
+        f"## {kind.name}" if not kind.form_of else f"### {kind.form_of} with `{further_of(kind)}`",
         "",
         f"{_escaped(kind.about)} Its place: `{kind.where}`.",
         "",
@@ -97,10 +97,9 @@ def _section(kind: Kind) -> str:
         "",
         f"Source: {_escaped(kind.source)}",
         "",
-        f"![What {kind.name} does]({PICTURES}/{kind.name}.svg)",
-        "",
     ]
-    return "\n".join(lines)
+    picture = [f"![What {kind.name} does]({PICTURES}/{kind.name}.svg)", ""] if not kind.form_of else []
+    return "\n".join([*lines, *picture, *(_section(form) for form in forms_of(kind.name))])
 
 
 def _row(p: Parameter) -> str:

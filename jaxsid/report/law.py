@@ -10,7 +10,7 @@ from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.explain import element_place
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.gap.ranking import ERRORS
-from jaxsid.mechanics.effects.catalogue import CATALOGUE, parameter_row
+from jaxsid.mechanics.effects.catalogue import law_of, parameter_row
 from jaxsid.mechanics.effects.kind import Kind, Motion, Nominal
 from jaxsid.mechanics.lumped import GROUND, Effect, LumpedModel, second_order, with_effects
 from jaxsid.mechanics.slots import nominal_at, slots_of
@@ -81,7 +81,7 @@ def _force(
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Force of a model's one effect, and mass that it adds: a map knows no acceleration."""
     (effect,) = model.effects
-    kind = CATALOGUE[effect.kind]
+    kind = law_of(effect.kind, effect.parameters)
     at = Nominal(*(x[0] for x in nominal_at(slots_of(model), second_order(model))))
     values = list(parameter_row(effect.kind, effect.parameters, record)[: len(kind.parameters)])
     if kind.changes is not None:

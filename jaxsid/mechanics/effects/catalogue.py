@@ -2,7 +2,7 @@
 
 import difflib
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
@@ -26,13 +26,48 @@ def _found() -> dict[str, Kind]:
     return {module.EFFECT.name: module.EFFECT for module in modules}
 
 
-CATALOGUE: Mapping[str, Kind] = MappingProxyType(_found())
-MOST_PARAMETERS = max(len(kind.parameters) for kind in CATALOGUE.values())
+LAWS: Mapping[str, Kind] = MappingProxyType(
+    _found()
+)  # with the forms that kinds have, each of a name of its own
+CATALOGUE: Mapping[str, Kind] = MappingProxyType({n: k for n, k in LAWS.items() if not k.form_of})
+MOST_PARAMETERS = max(len(kind.parameters) for kind in LAWS.values())
 
 
 def kind_number(name: str) -> int:
-    """Position of a kind in the catalogue."""
-    return list(CATALOGUE).index(name)
+    """Position of a law among all."""
+    return list(LAWS).index(name)
+
+
+def law_of(name: str, parameters: Iterable[str]) -> Kind:
+    """The law of an effect: its kind, or the form of it that has the parameters which are given.
+
+    Args:
+        name: of the kind.
+        parameters: names of those given.
+    """
+    kind = CATALOGUE[name]
+    further = set(parameters) - {p.name for p in kind.parameters}
+    forms = (k for k in forms_of(name) if further <= {p.name for p in k.parameters})
+    return next(forms, kind) if further else kind
+
+
+def forms_of(name: str) -> list[Kind]:
+    """Further laws that effects of a kind have, told by a parameter more.
+
+    Args:
+        name: of the kind.
+    """
+    return [kind for kind in LAWS.values() if kind.form_of == name]
+
+
+def further_of(form: Kind) -> str:
+    """The parameter that tells a form of a kind from it.
+
+    Args:
+        form: of a kind.
+    """
+    (name,) = {p.name for p in form.parameters} - {p.name for p in CATALOGUE[form.form_of].parameters}
+    return name
 
 
 def kind_named(name: str, said: str) -> Kind:
@@ -63,6 +98,7 @@ def check_effect(name: str, where: str, parameters: Mapping[str, ArrayLike], sai
     """
     kind = kind_named(name, said)
     require(where == kind.where, f"{said}: its place is '{kind.where}', not '{where}'.")
+    kind = law_of(name, parameters)
     names = [p.name for p in kind.parameters]
     for given in parameters:
         require(given in names, f"{said}: it has no parameter '{given}'; choose from {', '.join(names)}.")
@@ -86,7 +122,7 @@ def parameter_row(name: str, parameters: Mapping[str, ArrayLike], record: int) -
         record: number of the record, for those that have one a record; the last where there are fewer.
     """
     row = []
-    for p in CATALOGUE[name].parameters:
+    for p in law_of(name, parameters).parameters:
         value = jnp.ravel(jnp.asarray(parameters.get(p.name, p.default), dtype=float))
         row.append(value[min(record, len(value) - 1)])
     return jnp.stack([*row, *[jnp.zeros(())] * (MOST_PARAMETERS - len(row))])
@@ -100,7 +136,7 @@ def scales(name: str, at: Amplitudes, given: Mapping[str, ArrayLike] = MappingPr
         at: how its place moves.
         given: values of parameters that are the power of another's unit; their defaults where left out.
     """
-    parameters = CATALOGUE[name].parameters
+    parameters = law_of(name, given).parameters
     powers = {p.name: given.get(p.name, 1.0 if p.default is None else p.default) for p in parameters}
     return [p.scale.of(at) ** (powers[p.raised] if p.raised else 1) for p in parameters]
 
@@ -135,7 +171,7 @@ def by_sort(kinds: Int[Array, " slots"]) -> Sorted:
     Args:
         kinds: known numbers.
     """
-    every = [sort_of(kind) for kind in CATALOGUE.values()]
+    every = [sort_of(kind) for kind in LAWS.values()]
     return Sorted(kinds, tuple(every[i] for i in np.asarray(kinds)))
 
 
@@ -153,10 +189,10 @@ def possible(kinds: Numbers) -> list[Kind]:
         kinds: numbers of the kinds.
     """
     if isinstance(kinds, np.ndarray):
-        return [kind for number, kind in enumerate(CATALOGUE.values()) if number in kinds]
+        return [kind for number, kind in enumerate(LAWS.values()) if number in kinds]
     if isinstance(kinds, Sorted):
-        return [kind for kind in CATALOGUE.values() if sort_of(kind) in kinds.sorts]
-    return list(CATALOGUE.values())
+        return [kind for kind in LAWS.values() if sort_of(kind) in kinds.sorts]
+    return list(LAWS.values())
 
 
 def _total(hook: str, kinds: Numbers, parameters: Array, seen: Any) -> Array:
@@ -194,7 +230,7 @@ def rubbing(kinds: Numbers) -> Bool[Array, " slots"] | Bool[np.ndarray, " slots"
     """Which slots are dry friction, whatever its magnitude."""
     if isinstance(kinds, Sorted):
         return np.array([sort == "dry" for sort in kinds.sorts], bool)
-    numbers = [kind_number(kind.name) for kind in CATALOGUE.values() if kind.slip is not None]
+    numbers = [kind_number(kind.name) for kind in LAWS.values() if kind.slip is not None]
     return (np if isinstance(kinds, np.ndarray) else jnp).isin(kinds, np.array(numbers))
 
 

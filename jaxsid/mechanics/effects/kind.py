@@ -122,6 +122,7 @@ class Kind(NamedTuple):
         steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
         restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
         timed: whether its force goes by the time, too.
+        form_of: the kind that it is a form of, told apart by a parameter more; "" for one of its own.
     """
 
     name: str
@@ -141,6 +142,7 @@ class Kind(NamedTuple):
     steady: bool = False
     restoring: bool = False
     timed: bool = False
+    form_of: str = ""
 
     @property
     def smooth(self) -> bool:
