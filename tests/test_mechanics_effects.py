@@ -115,6 +115,21 @@ def test_motion_is_that_of_the_reference(kind, place, parameters, limit):
     assert error(plain, truth) > 0.02  # the effect is there to be seen
 
 
+def test_friction_that_hardly_gives_is_friction_that_sticks():
+    """As the stiffness grows; steps of the first tries are too long for it."""
+    u, rigid = drive(), {k: v for k, v in GIVING.items() if k != "stiffness"}
+    sticking = np.asarray(jaxsid.simulate(chain([effect("stribeck_friction", JOINT, rigid)]), record(u)))
+    far = [
+        error(
+            jaxsid.simulate(chain([effect("stribeck_friction", JOINT, rigid | {"stiffness": k})]), record(u)),
+            sticking,
+        )
+        for k in (3e3, 1e4, 3e4)
+    ]
+    assert far[1] < 0.8 * far[0]
+    assert far[2] < 0.8 * far[1] < 0.1
+
+
 def test_every_kind_is_checked():
     assert {case[0] for case in CASES} == set(CATALOGUE)
 
