@@ -1,5 +1,6 @@
 """The second half of the report of a diagnosis: effects, fitted law, before and after, closure."""
 
+import re
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -81,8 +82,10 @@ def test_the_ranking_names_kind_place_and_parameters(cubic):
     (row,) = selected.rows
     assert (row[0].text, row[0].small) == ("cubic stiffness", "between b1 and b2")
     assert row[2].text == "F = p d^3"
-    value, std = row[1].text.removeprefix("coefficient ").split(" N/m")[0].split(" ± ")
-    assert abs(float(value) - COEFFICIENT) < 5 * float(std)
+    # such as 998765 ± 432 N/m³, or (1.00012 ± 0.00043)·10⁶ N/m³
+    size = 1e6 if "10⁶" in row[1].text else 1.0
+    value, std = (size * float(x) for x in re.findall(r"[\d.]+", row[1].text)[:2])
+    assert abs(value - COEFFICIENT) < 5 * std
     assert ranking.rows[0][0] == row[0]
     assert len(ranking.rows) > 1
     effects = cubic.effects()
@@ -174,6 +177,18 @@ def test_a_memory_is_followed_along_the_motion(cubic):
     force = _swing(Place("between", ("b1", "b2")))
     law = law_along(found, force)
     np.testing.assert_allclose(law, 100.0 * (force.displacement - force.displacement[0]), atol=1e-3)
+
+
+def test_a_law_far_quicker_than_the_samples_is_followed(cubic):
+    """Friction that gives by a thousandth of the swing slides all the time but where it turns round."""
+    parameters = {"force": 2.0, "static_force": 3.0, "velocity": 0.005, "stiffness": 1e6}
+    found = _with_effect(cubic, Effect("stribeck_friction", (("between", ("b1", "b2")),), parameters))
+    force = _swing(Place("between", ("b1", "b2")))
+    speed = force.velocity
+    sliding = np.sign(speed) * (2.0 + np.exp(-((speed / 0.005) ** 2)))
+    law, past = law_along(found, force), (np.abs(speed) > 5e-3) & (force.time > 0.02)
+    np.testing.assert_allclose(law[past], sliding[past], atol=0.05)
+    assert np.abs(law).max() < 3.0
 
 
 def test_a_load_on_a_body_opposes_the_force_from_the_ground(cubic):
