@@ -41,7 +41,7 @@ def close(experiment, tolerance):
 # --- exact recovery
 
 
-QUICK = (("chain3", "era_dc"), ("rig", "era"))
+QUICK = (("rig", "era"),)
 SLOW = [(s, r) for s in BUILT_IN for r in ("era", "era_dc") if s not in MODAL and (s, r) not in QUICK]
 
 
@@ -124,6 +124,7 @@ def test_regularized_estimates_are_nearly_right_without_noise(method):
     np.testing.assert_allclose(got[2:4], experiment.truth[2:4], rtol=0.2)
 
 
+@pytest.mark.slow
 def test_fourier_from_records_of_a_response_that_dies_out():
     experiment = make("railway_vehicle", data="record", method="fourier", noise=0.0, record_samples=4000)
     got = call(experiment)
@@ -229,7 +230,7 @@ def test_an_ensemble_is_the_calls():
         )
 
 
-@pytest.mark.parametrize("colour", ["white", "coloured", "quantization"])
+@pytest.mark.parametrize("colour", ["white", "coloured", pytest.param("quantization", marks=pytest.mark.slow)])
 def test_estimates_scatter_around_the_truth(colour):
     experiment = make("chain2", colour=colour)
     many = ensemble(experiment, KEY, 200)
