@@ -41,6 +41,39 @@ def test_a_lone_frequency_is_found_on_and_between_lines(between):
     assert found.share == pytest.approx(np.sqrt(2 / 3), abs=0.1)
 
 
+def test_a_frequency_that_records_share_is_found_where_one_alone_is_not_sure():
+    """Of records of unlike lengths and sensors; what each has at a frequency of its own is chance."""
+    noise = known(np.ones(3))
+    noise.taps[:, 1:] = 0.0
+
+    def p_of(first, second):
+        records = []
+        for seed, hertz, samples in ((1, first, SAMPLES), (2, second, 600)):
+            tone = 0.45 * np.sin(2 * np.pi * hertz * DT * np.arange(samples))
+            y = white(seed)[:samples] + tone[:, None] * [0.0, 1.0, 0.0]
+            if seed == 2:
+                y[:, 2] = np.nan
+            records.append(record(np.zeros(samples), y))
+        return _lone_line(as_given(chain(), records, [noise, noise]), (), ()).p_value
+
+    assert p_of(17.3, 17.3) < 1e-3
+    assert p_of(17.3, 31.1) > 5e-3
+
+
+def test_several_records_of_white_noise_hold_none():
+    noise = known(np.ones(3))
+    noise.taps[:, 1:] = 0.0
+
+    def p_of(seed):
+        records = [record(np.zeros(n), white(2 * seed + i)[:n]) for i, n in enumerate((SAMPLES, 500))]
+        return _lone_line(as_given(chain(), records, [noise, noise]), (), ()).p_value
+
+    p = np.array([p_of(seed) for seed in range(1000, 1100)])
+    # at most 10 of 100 expected, give or take 3
+    assert (p < 0.1).sum() <= 20
+    assert p.min() > 1e-4
+
+
 def test_low_frequencies_are_no_lone_one_at_the_other_end():
     slow = np.cumsum(white(0), axis=0)
     assert lone(slow).p_value > 1e-3

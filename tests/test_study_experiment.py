@@ -230,7 +230,9 @@ def test_an_ensemble_is_the_calls():
         )
 
 
-@pytest.mark.parametrize("colour", ["white", "coloured", pytest.param("quantization", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "colour", ["white", "coloured", pytest.param("quantization", marks=pytest.mark.slow)]
+)
 def test_estimates_scatter_around_the_truth(colour):
     experiment = make("chain2", colour=colour)
     many = ensemble(experiment, KEY, 200)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
 from jaxtyping import Float
-from scipy.stats import norm
+from scipy.stats import gamma, norm
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
@@ -35,6 +35,7 @@ DOUBT = 0.05  # likewise, from which on nothing speaks for it either
 COMMON, CHANGE = "common to sensors", "change with time"
 UNTOLD = 1e-6  # of an element's variance beforehand: less than that tells nothing of it
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
+APART = np.arange(-AROUND, AROUND + 1)
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
 HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
@@ -335,35 +336,78 @@ def _mean(shares: np.ndarray) -> float:
 
 
 def _lone_line(fit: Recalibrated, leveled: tuple[Setting, ...], noise: tuple[InputNoise, ...]) -> Test:
-    """Whether one frequency holds more, next to those around it, than chance gives to any: an F test of 2 degrees.
+    """Whether one frequency holds more, next to those around it, than chance gives to any, in a record or in all.
 
-    Lines are those of Hann's window, so that a frequency between two of them has no skirts; of those around it the
-    nearest are left out, and of the others every second, which share nothing. It must stand out from either side, and
-    from noise of the inputs, that has the model's resonances.
+    Of one record an F test of 2 degrees; of several that of Fisher, as what disturbs a body does so in each, and noise
+    of one has nothing to do with that of another. Lines are those of Hann's window, so that a frequency between two of
+    them has no skirts; of those around it the nearest are left out, and of the others every second, which share
+    nothing. It must stand out from either side, and from noise of the inputs, that has the model's resonances.
+
+    Source: R. A. Fisher, Statistical Methods for Research Workers, 4th ed., 1932, for several records.
     """
-    apart = np.arange(-AROUND, AROUND + 1)
-    below = ((apart >= GUARD) & (apart % 2 == GUARD % 2)).astype(float)
-    every = []
     beyond = (
         [_beyond_inputs(*x) for x in zip(leveled, noise, strict=True)] if noise else [1.0] * len(fit.settings)
     )
-    for setting, linear, size in zip(fit.settings, fit.linear, beyond, strict=True):
-        used = np.asarray(setting.spectra.weight) == 1
-        left = np.asarray(linear.left)[used][:, np.asarray(setting.spectra.present) > 0]
-        lines = left * (np.asarray(setting.scale) / size)[used][:, np.asarray(setting.spectra.present) > 0]
-        power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
-        # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
-        whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
-        part = _sums(np.abs(left[1:-1]) ** 2, np.ones(2 * GUARD - 1)) / whole
-        sides = [_sums(x, side) for side in (below, below[::-1]) for x in (power, np.ones_like(power))]
-        every.append(np.stack([power, part, *sides]).reshape(6, -1))
-    power, part, *sides = np.concatenate(every, axis=1)
+    every = [_alone(*x) for x in zip(fit.settings, fit.linear, beyond, strict=True)]
+    told = [np.asarray(s.spectra.present) > 0 for s in fit.settings]
+    alone, part = (
+        np.concatenate([x[i][:, seen].ravel() for x, seen in zip(every, told, strict=True)]) for i in (0, 1)
+    )
+    p, found = _least(alone), part[alone.argmin()]
+    if len(every) > 1:
+        together, share = _in_all(fit.settings, every)
+        p, found = min((2 * p, found), (2 * _least(together), share))
+    return Test("lone frequency", min(p, 1.0), float(np.sqrt(found) * left_share(fit)))
+
+
+def _alone(
+    setting: Setting, linear: Linear, size: np.ndarray | float
+) -> tuple[Float[np.ndarray, "lines outputs"], Float[np.ndarray, "lines outputs"]]:
+    """Probability of as much in each line of a record, by chance, and the part of all that is left that it holds."""
+    below = ((APART >= GUARD) & (APART % 2 == GUARD % 2)).astype(float)
+    used, present = np.asarray(setting.spectra.weight) == 1, np.asarray(setting.spectra.present) > 0
+    left = np.asarray(linear.left)[used][:, present]
+    lines = left * (np.asarray(setting.scale) / size)[used][:, present]
+    power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
+    # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
+    whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
+    part = _sums(np.abs(left[1:-1]) ** 2, np.ones(2 * GUARD - 1)) / whole
+    sides = [[_sums(x, side) for x in (power, np.ones_like(power))] for side in (below, below[::-1])]
     # on either side: the edge of what is strong at low frequencies is no lone one
-    pairs = ((np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in (sides[:2], sides[2:]))
+    pairs = [(np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in sides]
     alone = np.maximum(*((1 + power / np.maximum(x, np.finfo(float).tiny)) ** -n for x, n in pairs))
-    p = float(-np.expm1(len(alone) * np.log1p(-min(alone.min(), 0.5))))
-    share = np.sqrt(part[alone.argmin()]) * left_share(fit)
-    return Test("lone frequency", p, float(share))
+    shape = (len(used), len(present))
+    inside = np.ix_(np.flatnonzero(used)[1:-1], np.flatnonzero(present))
+    every = np.ones(shape), np.zeros(shape)
+    for values, own in zip(every, (alone, part), strict=True):
+        values[inside] = own
+    return every
+
+
+def _in_all(
+    settings: Sequence[Setting], every: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Probability of as much at the lines of the longest record in all that have a sensor, and the part of the least.
+
+    Lines of the others are those nearest in frequency.
+    """
+    grids = [np.asarray(s.spectra.omega) for s in settings]
+    long = int(np.argmax([len(x) for x in grids]))
+    rows = [np.abs(grid - grids[long][:, None]).argmin(axis=1) for grid in grids]
+    seen = np.array([np.asarray(s.spectra.present) > 0 for s in settings]).sum(axis=0)
+    tiny = np.finfo(float).tiny
+    total = -np.sum(
+        [np.log(np.maximum(p[row], tiny)) for (p, _), row in zip(every, rows, strict=True)], axis=0
+    )
+    p = gamma.sf(total, np.maximum(seen, 1))[:, seen > 1]
+    if not p.size:
+        return np.ones(1), 0.0
+    return p.ravel(), float(every[long][1][:, seen > 1].ravel()[p.argmin()])
+
+
+def _least(p: Float[np.ndarray, " n"]) -> float:
+    """Probability that the least of so many is as small by chance."""
+    return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 0.5))))
 
 
 def _beyond_inputs(setting: Setting, noise: InputNoise) -> Float[np.ndarray, "lines outputs"]:
