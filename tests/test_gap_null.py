@@ -1,15 +1,19 @@
 """Tests for a lone frequency, a small offset, and elements off by more than they may be, as often as they should."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gap_bench import known
 from gap_helpers import DT, chain, drive, exact, fed_back, noisy, record
+from scipy.linalg import eigh
 from scipy.special import gammaincc
 
-from jaxsid.gap.noise import noise_of
+from jaxsid.gap.noise import Noise, noise_of
 from jaxsid.gap.null import _lone_line, farthest_test, null_test, ratio_law
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, recalibrated
+from jaxsid.mechanics.lumped import second_order
+from jaxsid.physical.elements import element_matrices, with_values
 
 SAMPLES = 800
 
@@ -58,6 +62,26 @@ def test_a_frequency_that_records_share_is_found_where_one_alone_is_not_sure():
 
     assert p_of(17.3, 17.3) < 1e-3
     assert p_of(17.3, 31.1) > 5e-3
+
+
+@pytest.mark.parametrize(("damping", "found"), [(4.0, True), (1e-4, False)])
+def test_a_tone_that_noise_took_for_its_colour_is_found_but_not_a_mode_that_rings(damping, found):
+    """At the second mode of a model that damps it, or of one where noise shakes it as long as the record lasts."""
+    elements = element_matrices(chain())
+    quantity = np.array([x.quantity == "damping" for x in elements.listed])
+    nominal = np.asarray(elements.nominal)
+    model = with_values(chain(), jnp.asarray(np.where(quantity, damping * nominal, nominal)))
+    plain = second_order(model)
+    omega = np.sqrt(eigh(plain.stiffness, plain.mass, eigvals_only=True)[1])
+    tone = 3 * np.sin(omega * DT * np.arange(SAMPLES))[:, None] * [0.0, 1.0, 0.0]
+    # a filter of two poles on that frequency, which noise that holds a tone is taken for
+    pole = 0.998 * np.exp(1j * omega * DT)
+    taps = np.array([[1.0, 0.0, 0.0], [1.0, -2 * pole.real, abs(pole) ** 2], [1.0, 0.0, 0.0]])
+    noise = Noise(np.array([0.1, 1.0, 0.1]), taps, 0.0, "residual")
+    p = _lone_line(
+        as_given(model, [record(np.zeros(SAMPLES), tone + 0.1 * white(3))], [noise]), (), ()
+    ).p_value
+    assert p < 1e-20 if found else p > 1e-6
 
 
 def test_several_records_of_white_noise_hold_none():

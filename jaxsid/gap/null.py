@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float
 from scipy.stats import gamma, norm
 
 from jaxsid.gap.balance import balance_of
@@ -36,6 +36,7 @@ COMMON, CHANGE = "common to sensors", "change with time"
 UNTOLD = 1e-6  # of an element's variance beforehand: less than that tells nothing of it
 GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
 APART = np.arange(-AROUND, AROUND + 1)
+HALF = 0.5  # of all that is left, from which on a line holds most of it
 LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
 HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
@@ -363,25 +364,44 @@ def _lone_line(fit: Recalibrated, leveled: tuple[Setting, ...], noise: tuple[Inp
 def _alone(
     setting: Setting, linear: Linear, size: np.ndarray | float
 ) -> tuple[Float[np.ndarray, "lines outputs"], Float[np.ndarray, "lines outputs"]]:
-    """Probability of as much in each line of a record, by chance, and the part of all that is left that it holds."""
-    below = ((APART >= GUARD) & (APART % 2 == GUARD % 2)).astype(float)
+    """Probability of as much in each line of a record, by chance, and the part of all that is left that it holds.
+
+    Noise may have taken a lone frequency for its colour, which then hides in skirts as wide as the colour has. What
+    holds most of all that is left is asked as it is, unless a mode of the model rings there as long as the record.
+    """
     used, present = np.asarray(setting.spectra.weight) == 1, np.asarray(setting.spectra.present) > 0
     left = np.asarray(linear.left)[used][:, present]
-    lines = left * (np.asarray(setting.scale) / size)[used][:, present]
-    power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
-    # the noise may have taken a lone frequency for its colour, but the part of it that is left is what it is
     whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
     part = _sums(np.abs(left[1:-1]) ** 2, np.ones(2 * GUARD - 1)) / whole
-    sides = [[_sums(x, side) for x in (power, np.ones_like(power))] for side in (below, below[::-1])]
-    # on either side: the edge of what is strong at low frequencies is no lone one
-    pairs = [(np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in sides]
-    alone = np.maximum(*((1 + power / np.maximum(x, np.finfo(float).tiny)) ** -n for x, n in pairs))
-    shape = (len(used), len(present))
+    alone = _standing_out(left * (np.asarray(setting.scale) / size)[used][:, present])
+    most = (part > HALF) & ~_ringing(setting)[used][1:-1, None]
+    alone = np.where(most, np.minimum(alone, _standing_out(left)), alone)
+    every = np.ones((len(used), len(present))), np.zeros((len(used), len(present)))
     inside = np.ix_(np.flatnonzero(used)[1:-1], np.flatnonzero(present))
-    every = np.ones(shape), np.zeros(shape)
     for values, own in zip(every, (alone, part), strict=True):
         values[inside] = own
     return every
+
+
+def _standing_out(lines: Complex[np.ndarray, "lines outputs"]) -> Float[np.ndarray, "inner outputs"]:
+    """F test of each line but the outermost against those on either side: the edge of what is strong is no lone one."""
+    below = ((APART >= GUARD) & (APART % 2 == GUARD % 2)).astype(float)
+    power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
+    sides = [[_sums(x, side) for x in (power, np.ones_like(power))] for side in (below, below[::-1])]
+    pairs = [(np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in sides]
+    return np.maximum(*((1 + power / np.maximum(x, np.finfo(float).tiny)) ** -n for x, n in pairs))
+
+
+def _ringing(setting: Setting) -> Bool[np.ndarray, " lines"]:
+    """Lines about modes of the model that fade so slowly that noise which shakes them is as narrow as a lone one."""
+    linear, inverse = setting.spectra.linear, np.asarray(setting.spectra.inverse_mass)
+    count = len(inverse)
+    below = np.hstack([-inverse @ np.asarray(linear.stiffness), -inverse @ np.asarray(linear.damping)])
+    poles = np.linalg.eigvals(np.vstack([np.eye(count, 2 * count, count), below]))
+    omega = np.asarray(setting.spectra.omega)
+    reach = GUARD * omega[1]
+    poles = poles[np.abs(poles.real) < reach]
+    return (np.abs(omega[:, None] - np.abs(poles.imag)) < reach + np.abs(poles.real)).any(axis=1)
 
 
 def _in_all(
