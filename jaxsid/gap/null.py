@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, gammaincc
-from jaxtyping import Bool, Complex, Float
-from scipy.stats import gamma, norm
+from jaxtyping import Float
+from scipy.stats import norm
 
 from jaxsid.gap.balance import balance_of
 from jaxsid.gap.evidence import Force
 from jaxsid.gap.f_test import f_test
 from jaxsid.gap.innovations import coherence, innovations, unsteadiness
 from jaxsid.gap.input_noise import CERTAIN, LARGEST, InputNoise, input_noise, made, refitted, whitening
+from jaxsid.gap.lone_frequency import lone_frequency
 from jaxsid.gap.noise import BANDS
 from jaxsid.gap.places import Place
 from jaxsid.gap.ports import Guess, extents, ports_of, tables
@@ -34,10 +35,6 @@ SIGNIFICANT = 0.005  # probability by chance from which on nothing is claimed: o
 DOUBT = 0.05  # likewise, from which on nothing speaks for it either
 COMMON, CHANGE = "common to sensors", "change with time"
 UNTOLD = 1e-6  # of an element's variance beforehand: less than that tells nothing of it
-GUARD, AROUND = 4, 18  # lines from a lone one that it is compared with, from and to
-APART = np.arange(-AROUND, AROUND + 1)
-HALF = 0.5  # of all that is left, from which on a line holds most of it
-LEAST = 1e-12  # of a line's power, that those around it have: rounding
 CARRIED = 0.1  # of what noise of inputs leaves: tests may take it for a law, whose motion has it too
 HEARD = 30.0  # power of an input next to that of its noise from which on it is well above it
 MARGIN = 1.5  # times what it does on others that a law's share must be to be asked of those too
@@ -337,109 +334,18 @@ def _mean(shares: np.ndarray) -> float:
 
 
 def _lone_line(fit: Recalibrated, leveled: tuple[Setting, ...], noise: tuple[InputNoise, ...]) -> Test:
-    """Whether one frequency holds more, next to those around it, than chance gives to any, in a record or in all.
-
-    Of one record an F test of 2 degrees; of several that of Fisher, as what disturbs a body does so in each, and noise
-    of one has nothing to do with that of another. Lines are those of Hann's window, so that a frequency between two of
-    them has no skirts; of those around it the nearest are left out, and of the others every second, which share
-    nothing. It must stand out from either side, and from noise of the inputs, that has the model's resonances.
-
-    Source: R. A. Fisher, Statistical Methods for Research Workers, 4th ed., 1932, for several records.
-    """
+    """Whether one frequency stands out from noise of the inputs, too, that has the model's resonances."""
     beyond = (
         [_beyond_inputs(*x) for x in zip(leveled, noise, strict=True)] if noise else [1.0] * len(fit.settings)
     )
-    every = [_alone(*x) for x in zip(fit.settings, fit.linear, beyond, strict=True)]
-    told = [np.asarray(s.spectra.present) > 0 for s in fit.settings]
-    alone, part = (
-        np.concatenate([x[i][:, seen].ravel() for x, seen in zip(every, told, strict=True)]) for i in (0, 1)
-    )
-    p, found = _least(alone), part[alone.argmin()]
-    if len(every) > 1:
-        together, share = _in_all(fit.settings, every)
-        p, found = min((2 * p, found), (2 * _least(together), share))
-    return Test("lone frequency", min(p, 1.0), float(np.sqrt(found) * left_share(fit)))
-
-
-def _alone(
-    setting: Setting, linear: Linear, size: np.ndarray | float
-) -> tuple[Float[np.ndarray, "lines outputs"], Float[np.ndarray, "lines outputs"]]:
-    """Probability of as much in each line of a record, by chance, and the part of all that is left that it holds.
-
-    Noise may have taken a lone frequency for its colour, which then hides in skirts as wide as the colour has. What
-    holds most of all that is left is asked as it is, unless a mode of the model rings there as long as the record.
-    """
-    used, present = np.asarray(setting.spectra.weight) == 1, np.asarray(setting.spectra.present) > 0
-    left = np.asarray(linear.left)[used][:, present]
-    whole = np.maximum((np.abs(left) ** 2).sum(axis=0), np.finfo(float).tiny)
-    part = _sums(np.abs(left[1:-1]) ** 2, np.ones(2 * GUARD - 1)) / whole
-    alone = _standing_out(left * (np.asarray(setting.scale) / size)[used][:, present])
-    most = (part > HALF) & ~_ringing(setting)[used][1:-1, None]
-    alone = np.where(most, np.minimum(alone, _standing_out(left)), alone)
-    every = np.ones((len(used), len(present))), np.zeros((len(used), len(present)))
-    inside = np.ix_(np.flatnonzero(used)[1:-1], np.flatnonzero(present))
-    for values, own in zip(every, (alone, part), strict=True):
-        values[inside] = own
-    return every
-
-
-def _standing_out(lines: Complex[np.ndarray, "lines outputs"]) -> Float[np.ndarray, "inner outputs"]:
-    """F test of each line but the outermost against those on either side: the edge of what is strong is no lone one."""
-    below = ((APART >= GUARD) & (APART % 2 == GUARD % 2)).astype(float)
-    power = np.abs(lines[1:-1] - (lines[:-2] + lines[2:]) / 2) ** 2
-    sides = [[_sums(x, side) for x in (power, np.ones_like(power))] for side in (below, below[::-1])]
-    pairs = [(np.where(n > 0, np.maximum(x, LEAST * power), np.inf), n) for x, n in sides]
-    return np.maximum(*((1 + power / np.maximum(x, np.finfo(float).tiny)) ** -n for x, n in pairs))
-
-
-def _ringing(setting: Setting) -> Bool[np.ndarray, " lines"]:
-    """Lines about modes of the model that fade so slowly that noise which shakes them is as narrow as a lone one."""
-    linear, inverse = setting.spectra.linear, np.asarray(setting.spectra.inverse_mass)
-    count = len(inverse)
-    below = np.hstack([-inverse @ np.asarray(linear.stiffness), -inverse @ np.asarray(linear.damping)])
-    poles = np.linalg.eigvals(np.vstack([np.eye(count, 2 * count, count), below]))
-    omega = np.asarray(setting.spectra.omega)
-    reach = GUARD * omega[1]
-    poles = poles[np.abs(poles.real) < reach]
-    return (np.abs(omega[:, None] - np.abs(poles.imag)) < reach + np.abs(poles.real)).any(axis=1)
-
-
-def _in_all(
-    settings: Sequence[Setting], every: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[Float[np.ndarray, " n"], float]:
-    """Probability of as much at the lines of the longest record in all that have a sensor, and the part of the least.
-
-    Lines of the others are those nearest in frequency.
-    """
-    grids = [np.asarray(s.spectra.omega) for s in settings]
-    long = int(np.argmax([len(x) for x in grids]))
-    rows = [np.abs(grid - grids[long][:, None]).argmin(axis=1) for grid in grids]
-    seen = np.array([np.asarray(s.spectra.present) > 0 for s in settings]).sum(axis=0)
-    tiny = np.finfo(float).tiny
-    total = -np.sum(
-        [np.log(np.maximum(p[row], tiny)) for (p, _), row in zip(every, rows, strict=True)], axis=0
-    )
-    p = gamma.sf(total, np.maximum(seen, 1))[:, seen > 1]
-    if not p.size:
-        return np.ones(1), 0.0
-    return p.ravel(), float(every[long][1][:, seen > 1].ravel()[p.argmin()])
-
-
-def _least(p: Float[np.ndarray, " n"]) -> float:
-    """Probability that the least of so many is as small by chance."""
-    return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 0.5))))
+    p, part = lone_frequency(fit.settings, [np.asarray(x.left) for x in fit.linear], beyond)
+    return Test("lone frequency", p, float(np.sqrt(part) * left_share(fit)))
 
 
 def _beyond_inputs(setting: Setting, noise: InputNoise) -> Float[np.ndarray, "lines outputs"]:
     """Rms of all noise next to that of each sensor's own."""
     driven = np.asarray(setting.spectra.driven) * np.asarray(setting.scale)[:, :, None]
     return np.sqrt(1 + made(driven, noise.power) / noise.own)
-
-
-def _sums(x: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Of every column, about each row, as far as there are rows."""
-    half = len(around) // 2
-    return np.stack([np.convolve(c, around)[half : half + len(c)] for c in x.T], axis=1)
 
 
 def _power(fit: Recalibrated) -> Test:
