@@ -182,10 +182,8 @@ def _shrunk(tried: _Tried, whole: Sequence[Record], ends: tuple[int, ...]) -> _S
     motions = motions_to_begin(bench, whole, found.noises, found.scored)
     windowed = is_free_or_unstable(bench.model) or motions is not None
     lefts = partial(left_of, bench=bench, records=whole, ends=ends, windowed=windowed, motions=motions)
-    nominal = refitted(
-        bench._replace(tolerance=np.full_like(bench.tolerance, FIXED)),
-        Hypothesis(),
-    )
+    frozen = bench._replace(tolerance=np.full_like(bench.tolerance, FIXED))
+    nominal = refitted(frozen, Hypothesis())
     before = lefts(nominal), lefts(tried.linear)
     steps = tuple(map(lefts, tried.steps or [tried.chosen]))
     # what is left is noise where tests find nothing in it, else more than that

@@ -26,9 +26,8 @@ def _found() -> dict[str, Kind]:
     return {module.EFFECT.name: module.EFFECT for module in modules}
 
 
-LAWS: Mapping[str, Kind] = MappingProxyType(
-    _found()
-)  # with the forms that kinds have, each of a name of its own
+# laws, with the forms that kinds have under names of their own; and kinds
+LAWS: Mapping[str, Kind] = MappingProxyType(_found())
 CATALOGUE: Mapping[str, Kind] = MappingProxyType({n: k for n, k in LAWS.items() if not k.form_of})
 MOST_PARAMETERS = max(len(kind.parameters) for kind in LAWS.values())
 
