@@ -17,6 +17,7 @@ SETS = {
     "fourth": 17_300_000,
     "fifth": 19_900_000,
     "sixth": 22_700_000,
+    "seventh": 25_300_000,
 }
 NOISES = ((0.01, 0.6), (0.001, 0.2), (0.05, 0.2))
 FAMILIES = {
@@ -27,6 +28,7 @@ FAMILIES = {
     "fourth": ("mass", "chain", "drive", "frame"),
     "fifth": ("mass", "chain", "drive", "frame"),
     "sixth": ("mass", "chain", "drive", "frame"),
+    "seventh": ("mass", "chain", "drive", "frame"),
 }
 # of a cycle's cases, by family in the order above: a mass says little about places
 TESTED = (0.15, 0.35, 0.2, 0.3)
@@ -38,6 +40,7 @@ SHARES = {
     "fourth": TESTED,
     "fifth": TESTED,
     "sixth": TESTED,
+    "seventh": TESTED,
 }
 ONE_SENSOR, COLOURED = 0.15, 0.2
 
