@@ -3,8 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsid.mechanics.effects.kind import FORCE, SPEED, STIFFNESS, Kind, Motion, Parameter
-from jaxsid.mechanics.effects.prior import POSITIVE_PART, Scale, size, slab
+from jaxsid.mechanics.effects import stribeck_friction
+from jaxsid.mechanics.effects.kind import STIFFNESS, Kind, Motion, Parameter
+from jaxsid.mechanics.effects.prior import Scale, size
+
+RIGID = stribeck_friction.EFFECT
 
 
 def _force(at: Motion, force: Array, static_force: Array, velocity: Array, stiffness: Array) -> Array:
@@ -12,7 +15,7 @@ def _force(at: Motion, force: Array, static_force: Array, velocity: Array, stiff
 
 
 def _rate(at: Motion, force: Array, static_force: Array, velocity: Array, stiffness: Array) -> Array:
-    level = force + (static_force - force) * jnp.exp(-((at.velocity / velocity) ** 2))
+    level = stribeck_friction.level(at.velocity, force, static_force, velocity)
     return at.velocity - stiffness * jnp.abs(at.velocity) * at.memory / jnp.where(level > 0, level, 1.0)
 
 
@@ -22,13 +25,11 @@ def _sensible(force: float, static_force: float, velocity: float, stiffness: flo
 
 EFFECT = Kind(
     name="presliding_friction",
-    form_of="stribeck_friction",
+    form_of=RIGID.name,
     where="between",
     parameters=(
-        Parameter("force", FORCE, Scale(force=1), POSITIVE_PART, lowest=0.0),
-        Parameter("static_force", FORCE, Scale(force=1), slab(0.5, lowest=0.0), lowest=0.0),
-        Parameter("velocity", SPEED, Scale(velocity=1), size(0.3, 3.0), lowest=0.0),
-        # a twentieth of the motion, within which surfaces give
+        *RIGID.parameters,
+        # surfaces give within a small part of the motion
         Parameter("stiffness", STIFFNESS, Scale(force=1, displacement=-1), size(10.0, 3.0), lowest=0.0),
     ),
     law="F = k z, z' = v - k abs(v) z / (Fc + (Fs - Fc) exp(-(v/vs)^2))",

@@ -7,7 +7,15 @@ from jaxsid.mechanics.effects.kind import FORCE, SPEED, Kind, Parameter
 from jaxsid.mechanics.effects.prior import POSITIVE_PART, Scale, size, slab
 
 
-def _slip(speed: Array, force: Array, static_force: Array, velocity: Array) -> Array:
+def level(speed: Array, force: Array, static_force: Array, velocity: Array) -> Array:
+    """What friction rubs with at a speed.
+
+    Args:
+        speed: of sliding, of either sign.
+        force: at high speeds.
+        static_force: at rest.
+        velocity: at which it has fallen.
+    """
     return force + (static_force - force) * jnp.exp(-((speed / velocity) ** 2))
 
 
@@ -26,6 +34,6 @@ EFFECT = Kind(
     law="F = (Fc + (Fs - Fc) exp(-(v/vs)^2)) sign(v), sticking at v = 0",
     about="Lubricated contacts break loose at a static level and slide at a lower one, so that slow motion jerks.",
     source="B. Armstrong-Helouvry, P. Dupont and C. Canudas de Wit, Automatica 30 (1994).",
-    slip=_slip,
+    slip=level,
     sensible=_sensible,
 )
