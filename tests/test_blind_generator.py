@@ -18,7 +18,9 @@ import draw  # pyright: ignore[reportMissingImports]  # noqa: E402
 import equivalent  # pyright: ignore[reportMissingImports]  # noqa: E402
 import generate  # pyright: ignore[reportMissingImports]  # noqa: E402
 import laws  # pyright: ignore[reportMissingImports]  # noqa: E402
+import recalibrate  # pyright: ignore[reportMissingImports]  # noqa: E402
 import score  # pyright: ignore[reportMissingImports]  # noqa: E402
+import severity  # pyright: ignore[reportMissingImports]  # noqa: E402
 import systems  # pyright: ignore[reportMissingImports]  # noqa: E402
 from plan import SETS, plan  # pyright: ignore[reportMissingImports]  # noqa: E402
 from truth import Loop, respond  # pyright: ignore[reportMissingImports]  # noqa: E402
@@ -427,3 +429,20 @@ def test_scores_of_a_few_answers():
 def test_wilson_interval():
     low, high = score.wilson(9, 10)
     np.testing.assert_allclose([low, high], [0.5958, 0.9821], atol=1e-4)
+
+
+def test_what_other_numbers_do_as_well_is_no_gap_however_far_it_shifts_a_mode():
+    """A spring to the ground is one number more of a single mass's spring, and more than a linearized refit follows."""
+    u = np.random.default_rng(3).standard_normal(1500)
+    std = np.array([1e-4, 3e-3, 0.1])
+
+    def gaps(effect):
+        y = respond(MASS, (effect,), u, before=0, steps=24).y
+        linearized = severity.severity(MASS, u, y, std, 0).gap_recalibrated
+        return linearized, recalibrate.gap_left(MASS, u, y, std)
+
+    where = "between", ("ground", "b1")
+    linearized, left = gaps(systems.Effect("missing_connection", *where, {"stiffness": 60.0, "damping": 0.3}))
+    assert linearized > 1.0 > 0.05 > left
+    linearized, left = gaps(systems.Effect("cubic_stiffness", *where, {"coefficient": 3e5}))
+    assert left > 0.3 * linearized > 0.3

@@ -27,7 +27,7 @@ from jaxsid.gap.ranking import (
     still_due,
 )
 from jaxsid.gap.refit import Hypothesis, in_windows, refitted
-from jaxsid.gap.roughly import ALIKE, HERE, SIZES, loudest, roughly
+from jaxsid.gap.roughly import ALIKE, HERE, NEARLY, SIZES, loudest, roughly
 from jaxsid.gap.search import Found, _otherwise
 from jaxsid.gap.windows import BLOCKS
 
@@ -131,6 +131,16 @@ def test_springs_are_tried_wherever_a_law_acts(tried):
     fitted, _ = tried(candidates, {("end_stop", ("b1", "b3")): -10.0}, 2)
     assert ("missing_connection", ("b1", "b3")) in fitted
     assert ("coulomb_friction", ("b1", "b3")) not in fitted
+
+
+def test_springs_are_tried_where_the_best_laws_act_beside_the_very_best(tried):
+    """A law of a joined place may nearly stand for the spring beside it."""
+    places = [{"between": ("b1", f"b{i}")} for i in range(2, 4 + NEARLY)]
+    candidates = [candidate("end_stop", p) for p in places]
+    candidates += [candidate("missing_connection", p) for p in places]
+    evidences = {("end_stop", p["between"]): -10.0 * (i + 1) for i, p in enumerate(places)}
+    fitted, _ = tried(candidates, evidences, len(places))
+    assert [p for k, p in fitted if k == "missing_connection"] == [p["between"] for p in places[:NEARLY]]
 
 
 def test_the_order_of_two_ends_does_not_count():

@@ -9,8 +9,9 @@ import scipy.signal
 from excitation import drawn as signal_of
 from families import FAMILIES, deviating, sensors
 from laws import FORCES, INPUT, KINKED, OUTSIDE, SENSOR, UNLIKE
-from plan import SETS, Planned
+from plan import REFITTED, SETS, Planned
 from plant import plant
+from recalibrate import gap_left
 from severity import Severity, severity
 from sizes import ABSORBED, ANY, LIMITS, Scale, parameters, shape
 from systems import GROUND, Effect, System, frequencies, joint, matrices, spring
@@ -375,7 +376,7 @@ def drawn_case(which: str, case: Planned, samples: tuple[int, int] = SAMPLES) ->
         steps, change = _resolved(setup, effects, least, case.noise, [*seed, 1])
         effects = tuple(_on_grid(e, setup.true.dt / steps) for e in effects)
         made = _made(case, setup, effects, steps, seed, samples)
-        if made is not None:
+        if made is not None and not (which in REFITTED and _taken_up(case, setup, made)):
             return _labelled(case, setup, sized, made, steps, change, attempt)
     raise RuntimeError(f"case {case.number} of {which}: {case.kinds} cannot be seen in {DRAWS} systems")
 
@@ -387,6 +388,12 @@ class _Made(NamedTuple):
     noisy: tuple[np.ndarray, ...]
     severities: tuple[Severity, ...]
     each: tuple[float, ...]  # gap of each effect in the first record, beside the others
+
+
+def _taken_up(case: Planned, setup: _Setup, made: _Made) -> bool:
+    """Whether other numbers of the model do what a single effect does, as far as the noise lets one tell."""
+    run, alone = made.runs[0], len(case.kinds) == 1 and case.kinds[0] not in ABSORBED
+    return alone and gap_left(setup.true, run.u[run.before :], run.y[run.before :], made.std) < GAPS[0]
 
 
 def _rated(effects: tuple[Effect, ...], setup: _Setup, samples: int) -> tuple[Effect, ...]:

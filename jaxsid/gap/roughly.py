@@ -18,6 +18,7 @@ FEW = 10  # steps of a fit to one block alone
 ALIKE = 0.8  # part of the most that a block leaves, from which on another leaves as much
 LONGER = (5, 10), (3, 20)  # so many of the best go on for so many steps, if they are still on their way
 HERE = 6  # other laws that are tried where the best one acts, beside springs and dampers
+NEARLY = 3  # places, those of the best ones, where springs and dampers are tried
 HOPELESS = 10.0  # times the squares that the best one leaves, from which on none goes on
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 # times its number that a law begins with, where the one given leads to more than there is without it
@@ -61,7 +62,8 @@ def roughly(
 ) -> list[tuple[Candidate, Refit]]:
     """Candidates fitted to a part of the records, best first: some steps for each, more for the best.
 
-    The first ones, and further laws of the place where one of them fits best, even if it makes no sense there.
+    The first ones, springs and dampers where the best of them act, and further laws of the place where one of them
+    fits best, even if it makes no sense there.
 
     Args:
         part: of the records.
@@ -88,11 +90,12 @@ def roughly(
         return c, max(found, again, key=lambda x: x.fit.evidence)
 
     rough = side_by_side(begun, every[:tried])
-    best = max(rough, key=lambda x: x[1].fit.evidence)[0].place if rough else {}
-    here = [x for x in every[tried:] if ends_of(x[0].place) == ends_of(best)] if best else []
+    ahead = sorted(rough, key=lambda x: -x[1].fit.evidence)
+    places = list(dict.fromkeys(ends_of(c.place) for c, _ in ahead))[:NEARLY]
+    further = [x for x in every[tried:] if ends_of(x[0].place) in places]
     # a stop without play, or a stiffening spring that hardly stiffens, is a spring
-    bent = [x for x in here if not straight(x[0].kind)]
-    rough += side_by_side(begun, [x for x in here if straight(x[0].kind)] + bent[:HERE])
+    bent = [x for x in further if not straight(x[0].kind) and ends_of(x[0].place) == places[0]]
+    rough += side_by_side(begun, [x for x in further if straight(x[0].kind)] + bent[:HERE])
     for few, more in LONGER:
         rough.sort(key=lambda x: -value(x[1], part))
         most = HOPELESS * rough[0][1].fit.squares if rough else 0.0
