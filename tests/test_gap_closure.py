@@ -18,7 +18,7 @@ from jaxsid.gap.closure import (
 )
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
-from jaxsid.gap.refit import Hypothesis, refitted, shot_of
+from jaxsid.gap.refit import FINEST, UNRESOLVED, Hypothesis, refitted, shot_of
 from jaxsid.gap.windows import blocks_of, untold
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
 from jaxsid.mechanics.lumped import Effect
@@ -175,6 +175,27 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     np.testing.assert_array_equal(measured[:, :2], y[-SAMPLES:, :2])
     rms = np.sqrt((left[:, :2] ** 2).mean(axis=0)) / noise.rms()[:2]
     np.testing.assert_allclose(rms, 1, atol=0.1)
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+def test_steps_are_short_enough_for_a_motion_that_was_not_seen(monkeypatch, windowed):
+    """A loop whose memory is slow where the motion is small follows a large one at once."""
+    loop = effect("hysteresis", ("ground", "b1"), stiffness=300.0, beta=2e4, gamma=0.0, exponent=1.0)
+    u = drive(2 * SAMPLES) * np.repeat([0.02, 0.4], SAMPLES)
+    y, level = colored(exact(u), 0)
+    quiet = bench(y[:SAMPLES], level, u=u[:SAMPLES])
+    frozen = quiet._replace(tolerance=np.full(9, FIXED), substeps=2)
+    found = refitted(frozen, Hypothesis((loop,)), steps=0)
+
+    def left(substeps):
+        at = frozen._replace(substeps=substeps)
+        return left_of(found, at, [record(u, y)], [SAMPLES], windowed=windowed).left[0]
+
+    rms = lambda x: np.sqrt(np.nanmean(x**2, axis=0))  # noqa: E731
+    finest, own = left(FINEST), left(2)
+    assert (rms(own - finest) < UNRESOLVED * rms(finest)).all()
+    monkeypatch.setattr(module, "FINEST", 2)
+    assert not (rms(left(2) - finest) < UNRESOLVED * rms(finest)).any()
 
 
 def test_what_is_left_before_is_noise_sample_by_sample():

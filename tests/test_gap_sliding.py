@@ -7,8 +7,8 @@ from test_gap_causes import B12, BENCH, candidate, ranking, refit
 
 from jaxsid.gap.examine import examine
 from jaxsid.gap.explain import FIRST, TEMPERATURE, _whole, again, extended
-from jaxsid.gap.ranking import ranked
-from jaxsid.gap.refit import Hypothesis, bench_of, refitted
+from jaxsid.gap.ranking import Whole, ranked
+from jaxsid.gap.refit import FINEST, Hypothesis, bench_of, refitted
 from jaxsid.gap.sliding import FAR, FRICTION, LOOP, _begun, sliding
 from jaxsid.mechanics.effects.catalogue import CATALOGUE, LAWS, check_effect, law_of
 from jaxsid.mechanics.lumped import Effect
@@ -49,6 +49,33 @@ def test_a_loop_stays_one_though_it_slides():
     first = round_of("hysteresis", LOOPING, LOOPING | {"stiffness": 700.0})
     assert _begun(first.bench, first.ranked[0].refit.hypothesis.effects[0])
     assert sliding(first, silent) is first
+
+
+def test_a_loop_fitted_to_the_bottom_is_asked_with_the_shortest_steps(monkeypatch):
+    """Surfaces that hardly give follow at once; all is compared with steps that show it."""
+    c, steps = candidate(LOOP, B12, **LOOPING), []
+    whole = (np.zeros((1, 6)),) * len(BENCH.blocks)
+
+    def fit(bench, hypothesis, **_):
+        steps.append(bench.substeps)
+        found = refit(-50.0 if hypothesis.effects[0].kind == FRICTION else -80.0, hypothesis=hypothesis)
+        return found._replace(fit=found.fit._replace(states=whole))
+
+    monkeypatch.setattr("jaxsid.gap.sliding._begun", lambda bench, loop: [GIVING])
+    monkeypatch.setattr("jaxsid.gap.sliding.refitted", fit)
+    monkeypatch.setattr("jaxsid.gap.sliding.changes_of", lambda found, bench: None)
+    monkeypatch.setattr("jaxsid.gap.sliding.value", lambda found, bench: found.fit.evidence)
+    monkeypatch.setattr("jaxsid.gap.sliding.left_in", lambda bench, whole: 1.0)
+    own = refit(-90.0, hypothesis=extended(Hypothesis(), c, {}))
+    own = own._replace(fit=own.fit._replace(states=whole))
+    first = ranked([(c, own, -90.0, 1.0)], refit(-1e3), BENCH, TEMPERATURE)
+    found = sliding(first, silent, Whole(BENCH, own))
+    assert steps == [FINEST, FINEST]
+    assert [x.kind for x in found.ranked] == [FRICTION, LOOP]
+    assert found.ranked[0].evidence - found.ranked[1].evidence == pytest.approx(30.0)
+    assert found.bench.substeps == FINEST
+    monkeypatch.setattr("jaxsid.gap.sliding.value", lambda found, bench: found.fit.evidence - 31.0)
+    assert sliding(first, silent, Whole(BENCH, own)) is first
 
 
 def test_what_hardly_slides_is_not_tried(monkeypatch):

@@ -1,6 +1,6 @@
 """How far the gap shrinks on samples that nothing was chosen or fitted with."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxsid.gap.fit import STEPS, Prior, fitted
 from jaxsid.gap.free_run import Run, free_run
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.noise import Noise
-from jaxsid.gap.refit import JUMP, Bench, Refit, noise_part
+from jaxsid.gap.refit import FINER, FINEST, JUMP, UNRESOLVED, Bench, Refit, noise_part
 from jaxsid.gap.resume import step
 from jaxsid.gap.setting import LARGE
 from jaxsid.gap.shooting import products_of
@@ -127,16 +127,8 @@ def left_of(
         count = len(record.y) - first
         y = np.concatenate([_judged(b, b.y) for b in own])[:count]
         seen = np.concatenate([_judged(b, b.weight) for b in own])[:count] > 0
-        run, start = _run_on(found, bench, record, number)
-        if windowed:
-            near = (run.states, start) if motions is None else (motions[number], 0)
-            states = _states(found, bench, own, *near)
-            rest = np.concatenate(
-                [_judged(b, x) for b, x in zip(own, _left(found, bench, own, states), strict=True)]
-            )
-            rest = rest[:count]
-        else:
-            rest = run.outputs[first - start :] - y
+        motion = None if motions is None else motions[number]
+        rest = _resolved(found, bench, _Held(record, number, y, own, windowed, motion))
         mask = np.where(seen, 0.0, np.nan)
         left.append(rest + mask)
         measured.append(y + mask)
@@ -159,6 +151,57 @@ def left_before(found: Refit, bench: Bench) -> Left:
         measured[int(b.record[0])].append(_judged(b, b.y) + mask)
     windows = tuple(_length(bench) * m.dt for m in bench.moved)
     return Left(tuple(map(np.concatenate, left)), tuple(map(np.concatenate, measured)), windows)
+
+
+class _Held(NamedTuple):
+    """A record's held-out samples: their readings, their windows, whether these begin anew, and from which motion."""
+
+    record: Record
+    number: int
+    y: Float[np.ndarray, "samples outputs"]
+    blocks: Sequence[Block]
+    windowed: bool
+    motion: Float[np.ndarray, "samples n"] | None
+
+
+def _resolved(found: Refit, bench: Bench, held: _Held) -> Float[np.ndarray, "samples outputs"]:
+    """What is left of held-out samples, with steps so short that none of it is theirs: motion may be quicker there."""
+    while True:
+        rest, again = _held_out(found, bench, held)
+        finer = bench._replace(substeps=min(FINER * bench.substeps, FINEST))
+        if found.hypothesis.linear or finer.substeps == bench.substeps:
+            return rest
+        if (_rms(again(finer) - rest) <= UNRESOLVED * _rms(rest)).all():
+            return rest
+        bench = finer
+
+
+def _held_out(
+    found: Refit, bench: Bench, held: _Held
+) -> tuple[Float[np.ndarray, "samples outputs"], Callable[[Bench], Float[np.ndarray, "samples outputs"]]]:
+    """What is left, and what is with steps of another length and all else the same."""
+
+    def run_on(at: Bench) -> tuple[Run, int]:
+        return _run_on(found, at, held.record, held.number)
+
+    def beyond(run: Run) -> np.ndarray:
+        return run.outputs[len(run.outputs) - len(held.y) :] - held.y
+
+    if not held.windowed:
+        return beyond(run_on(bench)[0]), lambda at: beyond(run_on(at)[0])
+    run, start = run_on(bench)
+    near = (run.states, start) if held.motion is None else (held.motion, 0)
+    states = _states(found, bench, held.blocks, *near)
+
+    def in_windows(at: Bench) -> np.ndarray:
+        each = zip(held.blocks, _left(found, at, held.blocks, states), strict=True)
+        return np.concatenate([_judged(b, x) for b, x in each])[: len(held.y)]
+
+    return in_windows(bench), in_windows
+
+
+def _rms(x: Float[np.ndarray, "samples outputs"]) -> Float[np.ndarray, " outputs"]:
+    return np.sqrt((x**2).mean(axis=0))
 
 
 def _length(bench: Bench) -> int:

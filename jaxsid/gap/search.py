@@ -40,6 +40,7 @@ from jaxsid.gap.ranking import (
     WORTH,
     Explanation,
     Ranking,
+    Whole,
     alike,
     clearly,
     key_of,
@@ -61,6 +62,7 @@ from jaxsid.gap.refit import (
     weighed_anew,
 )
 from jaxsid.gap.screen import Candidate, unseen
+from jaxsid.gap.sliding import sliding
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
 
@@ -267,7 +269,7 @@ def _further(
     ranking = rank(at.bench, candidates, at.before, effort, say)
     if not ranking.ranked or not worth(ranking, LEAST if at.selected else _least(at.look)):
         return at.refused(ranking)
-    found = at.taken(ranking)
+    ranking, found = _slid(at, ranking, at.taken(ranking), say)
     if not (found.holds and found.selected[-1].told):
         return at.refused(ranking)
     say("what is left")
@@ -284,6 +286,15 @@ def _further(
     other = at.taken(plain)
     other = _left(other, model, seen) if other.holds else found
     return found if other.look.null.share > SHOWS * found.look.null.share else other
+
+
+def _slid(at: Found, ranking: Ranking, found: Found, say: Callable[[str], None]) -> tuple[Ranking, Found]:
+    """A round and what was taken of it, with friction that gives for a loop that slides once fitted to the bottom."""
+    if found.before is None or not found.holds:
+        return ranking, found
+    anew = sliding(ranking, say, Whole(found.bench, found.before))
+    other = found if anew is ranking else at.taken(anew)
+    return (anew, other) if other.holds else (ranking, found)
 
 
 def _left(at: Found, model: LumpedModel, seen: Sequence[Record]) -> Found:
