@@ -76,7 +76,6 @@ MOSTLY = 0.5
 MOST_TURNS = 5  # of asking again
 CLOSELY = 6  # laws of the most probable place that are tried where none leaves little
 AGAIN = 6  # others that an effect is compared with when it is asked again, of each sort
-SHOWS = 5.0  # times what tests find beside a law, from which on one of fewer numbers does not stand for it
 FAR = 4.0  # times what an effect left when it was found, that others which left more are not asked again
 
 
@@ -284,8 +283,7 @@ def _further(
         return found._replace(rounds=(*found.rounds[:-1], plain), selected=(*found.selected[:-1], last))
     say("what is left")
     other = at.taken(plain)
-    other = _left(other, model, seen) if other.holds else found
-    return found if other.look.null.share > SHOWS * found.look.null.share else other
+    return _left(other, model, seen) if other.holds else found
 
 
 def _slid(at: Found, ranking: Ranking, found: Found, say: Callable[[str], None]) -> tuple[Ranking, Found]:

@@ -138,6 +138,5 @@ ANGLE = Prior("uniform", 0.0, math.inf, -math.pi, math.pi)
 GAIN = slab(0.3, centre=1.0, lowest=0.0)  # of a nominal value
 PART = slab(0.3)  # of the force that the place carries
 POSITIVE_PART = slab(0.3, lowest=0.0)
-LATE = size(
-    0.1, 5.0
-)  # of one over the slowest rate: 1 to 25 ms for a mode at 3 Hz, and some samples for a stiff axis
+# of one over the slowest rate: 1 to 25 ms for a mode at 3 Hz, and some samples for a stiff axis
+LATE = size(0.1, 5.0)
