@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsid.gap.nested import nested
+from jaxsid.gap.phases import in_phase
 from jaxsid.gap.ranking import (
     CLOSE,
     ERRORS,
@@ -290,7 +291,7 @@ def again(x: Explanation, found: Refit) -> Candidate:
         found: the fit.
     """
     own = [e for e in found.hypothesis.effects if key_of(e.kind, dict(e.place)) == x.key]
-    parameters = {n: float(np.ravel(np.asarray(v))[0]) for e in own for n, v in e.parameters.items()}
+    parameters = {n: np.asarray(v, float) for e in own for n, v in e.parameters.items()}
     return Candidate(x.kind, x.place, parameters, np.zeros(0), x.evidence, math.nan, "", {})
 
 
@@ -363,7 +364,7 @@ def _whole(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any], effort: 
     What drifts away with one law need not with another, nor is what one leaves the noise of another.
     """
     search, linked = {"steps": effort.steps, "gain": FINE}, {"steps": LINKED, "gain": FINE}
-    found = refitted(bench, hypothesis, **start, **search)
+    found = refitted(bench, in_phase(bench, hypothesis, start), **start, **search)
     if not math.isfinite(found.fit.evidence):
         return Whole(bench, found)
     bench, found = tied(bench, found, **linked)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsid.mechanics.amplitudes import amplitudes
 from jaxsid.mechanics.effects.catalogue import MOST_PARAMETERS, by_sort, kind_number, law_of
+from jaxsid.mechanics.effects.kind import Kind
 from jaxsid.mechanics.effects.prior import Amplitudes, Prior
 from jaxsid.mechanics.lumped import Effect, LumpedModel, with_effects
 from jaxsid.mechanics.slots import Slots, slots_of
@@ -163,17 +164,27 @@ def coordinates_of(effects: Sequence[Effect], at: Amplitudes) -> Coordinates:
     for row, effect in enumerate(effects):
         parameters = law_of(effect.kind, effect.parameters).parameters
         names = [p.name for p in parameters]
-        own = Amplitudes(*(np.asarray(x)[row] for x in at))
+        moves, own = Amplitudes(*(np.asarray(x)[row] for x in at)), own_of_records(effect)
         for i, p in enumerate(parameters):
             values = _coordinate(p.prior)
-            scale = float(np.asarray(p.scale.of(own)))
+            scale = float(np.asarray(p.scale.of(moves)))
             values["scale"] = scale if np.isfinite(scale) and scale > 0 else 1.0
             values["raised"] = names.index(p.raised) if p.raised else -1
-            values["per_record"] = p.prior.shape == "uniform" and effect.place[0][0] == "body"
+            values["per_record"] = p.name in own
             for name, value in values.items():
                 table[name][row, i] = value
     whole = {"logarithmic": bool, "per_record": bool, "raised": int}
     return Coordinates(**{k: jnp.asarray(v.astype(whole.get(k, float))) for k, v in table.items()})
+
+
+def own_of_records(effect: Effect) -> list[str]:
+    """Names of an effect's parameters that each record has a value of: the phase of a force that goes on between them.
+
+    Args:
+        effect: its kind, parameters and place.
+    """
+    of = law_of(effect.kind, effect.parameters).parameters if effect.place[0][0] == "body" else ()
+    return [p.name for p in of if p.prior.shape == "uniform"]
 
 
 def _coordinate(prior: Prior) -> dict[str, float]:
@@ -213,8 +224,28 @@ def shifts_of(effects: Sequence[Effect], records: int) -> Float[np.ndarray, " n"
     for row, effect in enumerate(effects):
         for value in effect.parameters.values():
             if np.size(value) == records > 1:
-                found[:, row] = np.asarray(value)[1:] - np.asarray(value)[0]
+                found[:, row] = _within(np.asarray(value)[1:] - np.asarray(value)[0])
     return found.ravel()
+
+
+def _within(angle: np.ndarray) -> np.ndarray:
+    """The same angle no more than half a turn from zero."""
+    return np.asarray(np.angle(np.exp(1j * angle)))
+
+
+def upright(kind: Kind, values: Mapping[str, float | np.ndarray]) -> dict[str, float | np.ndarray]:
+    """The same parameters with the amplitude of a wave above zero and its angle no more than half a turn from zero.
+
+    Args:
+        kind: of effect.
+        values: of its parameters by name.
+    """
+    if kind.wave is None:
+        return dict(values)
+    amplitude, angle = (np.asarray(values[n], float) for n in kind.wave)
+    turned = _within(np.asarray(angle + np.pi * (amplitude < 0)))
+    new = dict(zip(kind.wave, (np.asarray(np.abs(amplitude)), turned), strict=True))
+    return {**values, **{n: v if v.ndim else float(v) for n, v in new.items()}}
 
 
 def with_parameters(effect: Effect, values: Mapping[str, Array | float | np.ndarray]) -> Effect:

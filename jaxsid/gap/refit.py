@@ -17,6 +17,7 @@ from jaxsid.gap.hypothesis import (
     effect_slots,
     parameter_rows,
     shifts_of,
+    upright,
     with_parameters,
 )
 from jaxsid.gap.noise import Noise, residual_noise
@@ -478,13 +479,14 @@ def _concluded(bench: Bench, hypothesis: Hypothesis, shot: Shot, fit: Fit) -> Re
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(rows.shape)
     found, deviations = [], []
     for row, effect in enumerate(effects):
-        names = [p.name for p in law_of(effect.kind, effect.parameters).parameters]
+        kind = law_of(effect.kind, effect.parameters)
+        names = [p.name for p in kind.parameters]
         own = np.asarray(shot.coordinates.per_record)[row]
         values = {
             n: every[:, row, i] if own[i] and bench.records > 1 else float(rows[row, i])
             for i, n in enumerate(names)
         }
-        found.append(with_parameters(effect, values))
+        found.append(with_parameters(effect, upright(kind, values)))
         deviations.append({n: float(deviation[row, i]) for i, n in enumerate(names)})
     nominal = np.asarray(element_matrices(bench.model).nominal)
     model = with_values(bench.model, jnp.asarray(nominal * (1 + fit.theta[:elements])))

@@ -44,7 +44,7 @@ class Candidate(NamedTuple):
     Attributes:
         kind: of effect.
         place: as of an `Effect`, such as {"between": ("ground", "b1")}.
-        parameters: to start a refit from, SI units.
+        parameters: to start a refit from, SI units; an array where each record has its own.
         changes: (e,) relative changes of the model's elements that go with it.
         evidence: its logarithm, up to what all candidates on the same motion share.
         left: sum of squares of what it leaves, in noise, by the number of equations.
@@ -54,7 +54,7 @@ class Candidate(NamedTuple):
 
     kind: str
     place: dict[str, Any]
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, float | np.ndarray]
     changes: Float[np.ndarray, " e"]
     evidence: float
     left: float

@@ -25,5 +25,6 @@ EFFECT = Kind(
     about="Magnets of a motor attract its teeth, balls of a guide pass its edge, teeth of a gear mesh.",
     source="T. M. Jahns and W. L. Soong, IEEE Trans. Ind. Electron. 43 (1996).",
     force=_force,
+    wave=("amplitude", "phase"),
     restoring=True,
 )

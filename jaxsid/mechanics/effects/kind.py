@@ -118,6 +118,7 @@ class Kind(NamedTuple):
         states: how many of its own it has: a memory, a lag, an attached mass's displacement and velocity.
         sensible: whether parameters, in their order, are such as the law is meant for; least values apart.
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
+        wave: its amplitude and its angle, half a turn of which is the other sign of the amplitude, if it has such.
         vibrates: rad/s at which a part of its own swings, from its parameters in their order.
         steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
         restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
@@ -138,6 +139,7 @@ class Kind(NamedTuple):
     states: int = 0
     sensible: Callable[..., bool] | None = None
     needs: Literal["", "joined", "apart"] = ""
+    wave: tuple[str, str] | None = None
     vibrates: Callable[..., float] | None = None
     steady: bool = False
     restoring: bool = False

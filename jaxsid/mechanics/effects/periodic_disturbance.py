@@ -23,5 +23,6 @@ EFFECT = Kind(
     about="An unbalanced fan or a pump nearby, a mains-frequency ripple; its phase differs from record to record.",
     source="L. Ljung, System Identification, 2nd ed., 1999, ch. 14.",
     force=_force,
+    wave=("amplitude", "phase"),
     timed=True,
 )
