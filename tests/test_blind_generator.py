@@ -392,6 +392,21 @@ def test_only_exact_equivalences_count():
     assert not equivalent.same_place(labelled("random_force", {"body": "b2"}), 0, {"input": "u"})
 
 
+def test_a_sinusoid_on_the_far_side_of_all_sensors_may_act_on_any_body_there():
+    def at(body: str, *sensed: str, kind: str = "periodic_disturbance", effects: int = 1) -> set[str]:
+        label = labelled(kind, {"body": body}, tuple(systems.Sensor(b, b, "acceleration") for b in sensed))
+        label["effects"] *= effects
+        return {b for _, _, names in equivalent.right_answers(label, 0) for b in names}
+
+    assert at("b1", "b2", "b3") == at("b2", "b2", "b3") == {"b1", "b2"}
+    assert at("b3", "b2", "b3") == {"b3"}
+    assert at("b1", "b1", "b3") == {"b1"}
+    assert at("b3", "b1") == {"b1", "b2", "b3"}
+    # a body's mass is told by its own resonance; beside another effect motions are no sums
+    assert at("b1", "b2", "b3", kind="missing_mode") == {"b1"}
+    assert at("b1", "b2", "b3", effects=2) == {"b1"}
+
+
 def test_what_is_said_of_an_answer_is_said_of_all_that_no_record_tells_from_it():
     place, sensor = {"input": "u"}, {"sensor": "s0"}
     at = [("input_delay", place, 0.5, 1), ("sensor_delay", sensor, 0.4, 1), ("sensor_lag", sensor, 0.05, 1)]

@@ -16,6 +16,7 @@ SWAPPED = {
     "actuator_lag": "sensor_lag",
 }
 PARALLEL = 1e-6
+LINES = 0.2, 0.7, 1.9  # of a typical frequency of the system, at which responses are compared
 
 
 def answer(kind: str, place: dict[str, Any]) -> Answer:
@@ -74,9 +75,8 @@ def _not_told(label: dict[str, Any], kind: str, own: set[Answer], *, alone: bool
     system, found = system_of(label["true"]), set()
     if label["one_sensor"] and alone:
         found |= _in_series(kind, system)
-    if label["one_sensor"] and kind == "periodic_disturbance":
-        # a sinusoid on any body is one at the sensor, of free amplitude and phase
-        found |= {answer(kind, {"body": b}) for b in system.bodies}
+    if kind == "periodic_disturbance" and alone:
+        found |= _same_lines(own, system)
     if kind in ("constant_load", "sensor_bias"):
         found |= _same_offsets(own, system)
     return found
@@ -88,6 +88,28 @@ def _in_series(kind: str, system: System) -> set[Answer]:
     if kind in SWAPPED:
         return {answer(SWAPPED[kind], {"sensor": system.sensors[0].name})}
     return {answer(back[kind], {"input": system.inputs[0].name})} if kind in back else set()
+
+
+def _same_lines(own: set[Answer], system: System) -> set[Answer]:
+    """Sinusoids, of free amplitude and phase, whose readings are in the same proportions at any frequency.
+
+    One on any body, where one sensor reads it; one on any body that lies on the far side of all sensors, in a chain.
+    """
+    M, damping, K = matrices(system)
+    typical = np.sqrt(np.trace(K) / np.trace(M))
+    rows = [system.bodies.index(s.body) for s in system.sensors]
+    each = [np.linalg.inv(K - w**2 * M + 1j * w * damping)[rows] for w in np.multiply(LINES, typical)]
+    found = set()
+    for _, _, (mine,) in own:
+        at = system.bodies.index(mine)
+        for i, body in enumerate(system.bodies):
+            pairs = [
+                (np.abs(np.vdot(h[:, at], h[:, i])), np.linalg.norm(h[:, at]) * np.linalg.norm(h[:, i]))
+                for h in each
+            ]
+            if all(size and abs(along / size - 1) < PARALLEL for along, size in pairs):
+                found.add(answer("periodic_disturbance", {"body": body}))
+    return found
 
 
 def _same_offsets(own: set[Answer], system: System) -> set[Answer]:
