@@ -17,7 +17,7 @@ SEARCH = {"steps": 4, "gain": 2.0}  # from each of them, and the gain below whic
 
 
 def in_phase(bench: Bench, hypothesis: Hypothesis, start: dict[str, Any]) -> Hypothesis:
-    """A hypothesis whose last effect has phases from which a search comes to the end of those a quarter turn apart.
+    """A hypothesis whose last effect begins with those phases, a quarter turn apart, that a short search fits best.
 
     Args:
         bench: all records.
