@@ -34,6 +34,7 @@ from jaxsid.gap.refit import (
     tied,
     weighed_anew,
 )
+from jaxsid.gap.roughly import _of_waves, roughly
 from jaxsid.gap.search import Found, _followed
 from jaxsid.gap.windows import SHORTEST
 from jaxsid.mechanics.lumped import Effect, second_order
@@ -253,3 +254,35 @@ def test_a_law_that_was_taken_before_and_leaves_as_much_is_not_tried_again(monke
 
 def test_what_acts_between_no_bodies_is_not_followed(monkeypatch):
     assert followed(monkeypatch, [], True, {"input": ("drive",)})[3] is None
+
+
+# as a motion that drifts shows it: too short, turned round and too small
+DRIFTED = {"amplitude": 2.0, "wavenumber": 400.0, "phase": 3.5}
+
+
+def test_a_wave_that_is_far_off_is_found_by_its_other_lengths(snaps):
+    *_, close = snaps
+    c = candidate("cogging_ripple", B12, **DRIFTED)
+    without = refitted(close, Hypothesis())
+    ((_, found),) = roughly(close, [(c, hypothesis(DRIFTED), None)], without, 1, silent)
+    (effect,) = found.hypothesis.effects
+    for name, value in TRUE.items():
+        assert effect.parameters[name] == pytest.approx(value, rel=0.05)
+    # which the search from what was screened does not come to
+    lost = refitted(close, hypothesis(DRIFTED), steps=40)
+    assert lost.fit.evidence < found.fit.evidence - 100
+
+
+def test_only_a_wave_along_the_way_has_other_lengths():
+    every = _of_waves(hypothesis(DRIFTED), candidate("cogging_ripple", B12, **DRIFTED))
+    lengths = {float(h.effects[-1].parameters["wavenumber"]) for h in every}
+    assert len(lengths) == len(every) / 2
+    assert min(lengths) < TRUE["wavenumber"] < max(lengths)
+    hum = {"amplitude": 1.0, "frequency_hz": 3.0, "phase": 0.0}
+    of = Hypothesis((Effect("periodic_disturbance", (("body", "b1"),), hum),))
+    assert _of_waves(of, candidate("periodic_disturbance", {"body": "b1"}, **hum)) == []
+    spring = Hypothesis((Effect("cubic_stiffness", tuple(B12.items()), {"coefficient": 1e4}),))
+    assert _of_waves(spring, candidate("cubic_stiffness", B12, coefficient=1e4)) == []
+    # of what was found before nothing is changed
+    assert _of_waves(hypothesis(TRUE), candidate("cogging_ripple", B23, **DRIFTED)) == []
+    assert _of_waves(Hypothesis(), candidate("cogging_ripple", B12, **DRIFTED)) == []

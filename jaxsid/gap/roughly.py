@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxsid.gap.closely import followed_closely
 from jaxsid.gap.hypothesis import with_parameters
 from jaxsid.gap.ranking import ends_of, key_of, straight, value
 from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
 from jaxsid.gap.screen import Candidate
+from jaxsid.mechanics.effects.catalogue import CATALOGUE
+from jaxsid.mechanics.lumped import Effect
 from jaxsid.parallel import side_by_side
 
 STEPS, STEPS_A_NUMBER = 6, 3  # laws of many numbers take longer to be found
@@ -23,6 +26,8 @@ HOPELESS = 10.0  # times the squares that the best one leaves, from which on non
 FINE = 2.0  # gain of the search below which a candidate is fitted well enough to be compared
 # times its number that a law begins with, where the one given leads to more than there is without it
 SIZES = 2.0, 1.4, 0.7, 0.5, 0.25, 0.125
+# times the wavenumber and the amplitude that a wave along the way is screened with, where windows are of a few samples
+WAVENUMBERS, AMPLITUDE = np.geomspace(0.35, 7.5, 10), 2.0
 
 
 def loudest(bench: Bench, found: Refit) -> Bench:
@@ -81,6 +86,9 @@ def roughly(
         steps = STEPS + STEPS_A_NUMBER * len(c.parameters)
         search = {"changes": changes, "steps": steps, "gain": FINE}
         found = refitted(part, hypothesis, **search)
+        # such windows bend to the law from far off; screened on a motion that drifts its wave may be another
+        waves = _of_waves(hypothesis, c) if followed_closely(part) else []
+        found = max([found, *(refitted(part, h, **search) for h in waves)], key=lambda x: value(x, part))
         if found.fit.squares <= nothing or not math.isfinite(nothing):
             return c, found
         # screened on a motion that is not its own; from far off the search ends in another valley
@@ -131,15 +139,40 @@ def label(place: Mapping[str, Any]) -> str:
 
 def _of_sizes(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
     """The hypothesis with multiples of the number of its last effect, if that is the candidate and has but one."""
-    effect = of.effects[-1] if of.effects else None
-    if (
-        effect is None
-        or len(effect.parameters) != 1
-        or key_of(effect.kind, dict(effect.place)) != key_of(c.kind, c.place)
-    ):
+    effect = _own(of, c)
+    if effect is None or len(effect.parameters) != 1:
         return []
     parts = [{n: k * np.asarray(v) for n, v in effect.parameters.items()} for k in SIZES]
     return [of._replace(effects=(*of.effects[:-1], with_parameters(effect, x))) for x in parts]
+
+
+def _of_waves(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
+    """The hypothesis with waves of other lengths, either way up, if the candidate is one along the way."""
+    effect = _own(of, c)
+    kind = CATALOGUE[c.kind]
+    if effect is None or kind.wave is None or kind.timed:
+        return []
+    amplitude, angle = kind.wave
+    given = {p.name: np.asarray(effect.parameters.get(p.name, p.default), float) for p in kind.parameters}
+    lengths = [n for n in given if n not in kind.wave]
+    new = [
+        {
+            **given,
+            **{n: k * given[n] for n in lengths},
+            amplitude: AMPLITUDE * given[amplitude],
+            angle: given[angle] + on,
+        }
+        for k in WAVENUMBERS
+        for on in (0.0, math.pi)
+    ]
+    return [of._replace(effects=(*of.effects[:-1], with_parameters(effect, x))) for x in new]
+
+
+def _own(of: Hypothesis, c: Candidate) -> Effect | None:
+    """The last effect, if it is the candidate."""
+    effect = of.effects[-1] if of.effects else None
+    same = effect is not None and key_of(effect.kind, dict(effect.place)) == key_of(c.kind, c.place)
+    return effect if same else None
 
 
 def _longer(found: Refit, *, part: Bench, steps: int) -> Refit:
