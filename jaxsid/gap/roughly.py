@@ -28,6 +28,7 @@ FINE = 2.0  # gain of the search below which a candidate is fitted well enough t
 SIZES = 2.0, 1.4, 0.7, 0.5, 0.25, 0.125
 # times the wavenumber and the amplitude that a wave along the way is screened with, where windows are of a few samples
 WAVENUMBERS, AMPLITUDE = np.geomspace(0.35, 7.5, 10), 2.0
+AT_FIRST, GO_ON = 3, 3  # steps with each of these waves, and how many of them go on
 
 
 def loudest(bench: Bench, found: Refit) -> Bench:
@@ -88,7 +89,11 @@ def roughly(
         found = refitted(part, hypothesis, **search)
         # such windows bend to the law from far off; screened on a motion that drifts its wave may be another
         waves = _of_waves(hypothesis, c) if followed_closely(part) else []
-        found = max([found, *(refitted(part, h, **search) for h in waves)], key=lambda x: value(x, part))
+        short = [refitted(part, h, **{**search, "steps": AT_FIRST}) for h in waves]
+        best = sorted(short, key=lambda x: -value(x, part))[:GO_ON]
+        found = max(
+            [found, *(_longer(x, part=part, steps=steps) for x in best)], key=lambda x: value(x, part)
+        )
         if found.fit.squares <= nothing or not math.isfinite(nothing):
             return c, found
         # screened on a motion that is not its own; from far off the search ends in another valley
