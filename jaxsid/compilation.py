@@ -57,7 +57,7 @@ class _Place:
 
 _kept: _Folder | None = None
 _one_at_a_time = threading.RLock()  # compiling changes a setting of the whole process
-_in_memory: list[dict[bytes, _Program]] = []  # of each compiled function
+_in_memory: list[dict[Any, _Program]] = []  # of each compiled function
 
 
 def keep_programs(folder: str | Path | None, *, hurry: bool = False) -> None:
@@ -122,40 +122,61 @@ def compiled_in_full(function: Callable[P, T]) -> Callable[P, T]:
 def _kept_on_disk(function: Callable[P, T], own: dict[str, bool | str | int]) -> Callable[P, T]:
     jitted = eqx.filter_jit(function)
     programs: dict[bytes, _Program] = {}
-    _in_memory.append(programs)
+    called: dict[
+        Any, _Program
+    ] = {}  # the same by the calls themselves: to name one takes as long as many of them run
+    _in_memory.extend((programs, called))
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         if _kept is None:
             return jitted(*args, **kwargs)
         leaves, tree = jax.tree.flatten((args, kwargs))
-        options = {**_kept.options, **own}
-        key = _key(function, leaves, tree, _kept._replace(options=options))
-        if key is None:
+        if any(isinstance(x, jax.core.Tracer) for x in leaves):
             return jitted(*args, **kwargs)
-        program = programs.get(key)
+        options = {**_kept.options, **own}
+        settings = _settings(options)
+        alike = (tree, tuple(map(_seen, leaves)), settings, _kept.stamp)
+        try:
+            program = called.get(alike)
+        except (TypeError, ValueError):  # what cannot be hashed or compared goes by its name alone
+            alike = program = None
         if program is None:
+            key = _key(function, leaves, tree, settings, _kept.stamp)
+            if key is None:
+                return jitted(*args, **kwargs)
             path = _kept.path / key.hex()
             with _one_at_a_time:
                 program = programs.get(key) or _read(path) or _compile(function, leaves, tree, path, options)
                 programs[key] = program
+            if alike is not None:
+                called[alike] = program
         outputs = program.run(*(x for x in leaves if eqx.is_array(x)))
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Place) else x, program.result)
 
     return call
 
 
-def _key(function: Callable, leaves: list, tree: Any, kept: _Folder) -> bytes | None:
-    """Name of the program for this call; None where it is traced, or an argument has no name that lasts."""
-    if any(isinstance(x, jax.core.Tracer) for x in leaves) or jax.device_count() > 1:
+def _settings(options: dict[str, bool | str | int]) -> tuple[Any, ...]:
+    """What a program depends on besides its sources and the call."""
+    names = (getattr(jax.config, name) for name in SETTINGS)
+    return (jax.default_backend(), *names, os.environ.get("XLA_FLAGS"), tuple(options.items()))
+
+
+def _seen(x: Any) -> Any:
+    """What is equal for leaves of one program."""
+    if not eqx.is_array(x):
+        return type(x), x
+    return x.aval if isinstance(x, jax.Array) else (x.shape, x.dtype)
+
+
+def _key(
+    function: Callable, leaves: list, tree: Any, settings: tuple[Any, ...], stamp: bytes
+) -> bytes | None:
+    """Name of the program for this call; None where an argument has no name that lasts."""
+    if settings[0] != "cpu" or jax.device_count() > 1:
         return None
     described = [_Described(x) if eqx.is_array(x) else x for x in leaves]
-    settings = (
-        jax.default_backend(),
-        *(getattr(jax.config, name) for name in SETTINGS),
-        os.environ.get("XLA_FLAGS"),
-        kept.options,
-    )
     stream = io.BytesIO()
     pickler = _Namer(stream)
     pickler.fast = True  # without a memo, so that equal values give equal bytes
@@ -165,7 +186,7 @@ def _key(function: Callable, leaves: list, tree: Any, kept: _Folder) -> bytes | 
         )
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError):
         return None
-    return hashlib.sha256(kept.stamp + stream.getvalue()).digest() if settings[0] == "cpu" else None
+    return hashlib.sha256(stamp + stream.getvalue()).digest()
 
 
 class _Namer(pickle.Pickler):
