@@ -87,13 +87,7 @@ def roughly(
         steps = STEPS + STEPS_A_NUMBER * len(c.parameters)
         search = {"changes": changes, "steps": steps, "gain": FINE}
         found = refitted(part, hypothesis, **search)
-        # such windows bend to the law from far off; screened on a motion that drifts its wave may be another
-        waves = _of_waves(hypothesis, c) if followed_closely(part) else []
-        short = [refitted(part, h, **{**search, "steps": AT_FIRST}) for h in waves]
-        best = sorted(short, key=lambda x: -value(x, part))[:GO_ON]
-        found = max(
-            [found, *(_longer(x, part=part, steps=steps) for x in best)], key=lambda x: value(x, part)
-        )
+        found = max([found, *_from_afar(part, hypothesis, c, found, search)], key=lambda x: value(x, part))
         if found.fit.squares <= nothing or not math.isfinite(nothing):
             return c, found
         # screened on a motion that is not its own; from far off the search ends in another valley
@@ -142,23 +136,33 @@ def label(place: Mapping[str, Any]) -> str:
     return " - ".join(ends) if isinstance(ends, tuple | list) else str(ends)
 
 
+def _from_afar(
+    part: Bench, of: Hypothesis, c: Candidate, found: Refit, search: Mapping[str, Any]
+) -> list[Refit]:
+    """Fits of a candidate from elsewhere, where the motion that it is screened with may be far from its own."""
+    # windows of a few samples bend to a wave from far off
+    waves = _of_waves(of, c) if followed_closely(part) else []
+    short = [refitted(part, h, **{**search, "steps": AT_FIRST}) for h in waves]
+    best = sorted(short, key=lambda x: -value(x, part))[:GO_ON]
+    bent = [] if found.fit.settled else _hardly_bent(of, c)
+    on = [_longer(x, part=part, steps=search["steps"]) for x in best]
+    return on + [refitted(part, h, **search) for h in bent]
+
+
 def _of_sizes(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
     """The hypothesis with multiples of the number of its last effect, if that is the candidate and has but one."""
     effect = _own(of, c)
     if effect is None or len(effect.parameters) != 1:
         return []
-    parts = [{n: k * np.asarray(v) for n, v in effect.parameters.items()} for k in SIZES]
-    return [of._replace(effects=(*of.effects[:-1], with_parameters(effect, x))) for x in parts]
+    return _with(of, [{n: k * np.asarray(v) for n, v in effect.parameters.items()} for k in SIZES])
 
 
 def _of_waves(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
     """The hypothesis with waves of other lengths, either way up, if the candidate is one along the way."""
-    effect = _own(of, c)
-    kind = CATALOGUE[c.kind]
+    effect, kind = _own(of, c), CATALOGUE[c.kind]
     if effect is None or kind.wave is None or kind.timed:
         return []
-    amplitude, angle = kind.wave
-    given = {p.name: np.asarray(effect.parameters.get(p.name, p.default), float) for p in kind.parameters}
+    (amplitude, angle), given = kind.wave, _given(effect)
     lengths = [n for n in given if n not in kind.wave]
     new = [
         {
@@ -170,7 +174,28 @@ def _of_waves(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
         for k in WAVENUMBERS
         for on in (0.0, math.pi)
     ]
-    return [of._replace(effects=(*of.effects[:-1], with_parameters(effect, x))) for x in new]
+    return _with(of, new)
+
+
+def _hardly_bent(of: Hypothesis, c: Candidate) -> list[Hypothesis]:
+    """The hypothesis with laws that bend later, if the candidate has such."""
+    effect, kind = _own(of, c), CATALOGUE[c.kind]
+    if effect is None or kind.hardly_bent is None:
+        return []
+    given = _given(effect)
+    every = kind.hardly_bent(*(float(x) for x in given.values()))
+    return _with(of, [dict(zip(given, map(np.asarray, x), strict=True)) for x in every])
+
+
+def _given(effect: Effect) -> dict[str, np.ndarray]:
+    """Its parameters in their order, defaults where they are left out."""
+    every = CATALOGUE[effect.kind].parameters
+    return {p.name: np.asarray(effect.parameters.get(p.name, p.default), float) for p in every}
+
+
+def _with(of: Hypothesis, every: Sequence[Mapping[str, np.ndarray]]) -> list[Hypothesis]:
+    """The hypothesis with other parameters of its last effect."""
+    return [of._replace(effects=(*of.effects[:-1], with_parameters(of.effects[-1], x))) for x in every]
 
 
 def _own(of: Hypothesis, c: Candidate) -> Effect | None:

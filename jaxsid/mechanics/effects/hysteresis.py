@@ -6,6 +6,8 @@ from jaxtyping import Array
 from jaxsid.mechanics.effects.kind import NONE, STIFFNESS, Kind, Motion, Parameter, power
 from jaxsid.mechanics.effects.prior import PART, Scale, size, slab
 
+WIDER = (5.0, 1.0), (20.0, 0.5)  # times the distance at which a loop yields, and beta's part of what bends it
+
 
 def _force(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Array) -> Array:
     return stiffness * at.memory
@@ -19,6 +21,16 @@ def _rate(at: Motion, stiffness: Array, beta: Array, gamma: Array, exponent: Arr
 def _sensible(stiffness: float, beta: float, gamma: float, exponent: float) -> bool:
     # a loop that runs the other way round would feed the motion, and a memory that never saturates grows without bound
     return stiffness > 0 and beta + gamma > 0
+
+
+def _hardly_bent(
+    stiffness: float, beta: float, gamma: float, exponent: float
+) -> tuple[tuple[float, ...], ...]:
+    # one that yields too early holds the motion back as another: no search finds on from there
+    if not _sensible(stiffness, beta, gamma, exponent):
+        return ()
+    bends = (beta + gamma) ** (1 / exponent)
+    return tuple((stiffness, part * bends / k, (1 - part) * bends / k, 1.0) for k, part in WIDER)
 
 
 EFFECT = Kind(
@@ -37,5 +49,6 @@ EFFECT = Kind(
     restoring=True,
     rate=_rate,
     sensible=_sensible,
+    hardly_bent=_hardly_bent,
     states=1,
 )

@@ -119,6 +119,7 @@ class Kind(NamedTuple):
         sensible: whether parameters, in their order, are such as the law is meant for; least values apart.
         needs: "joined" or "apart" where it makes sense only between ends that the model joins, or does not; "" at any.
         wave: its amplitude and its angle, half a turn of which is the other sign of the amplitude, if it has such.
+        hardly_bent: other parameters, in their order, from given ones: of laws that bend later, for a search to begin.
         vibrates: rad/s at which a part of its own swings, from its parameters in their order.
         steady: whether it is the same at all times, so that of the lines of a spectrum that of zero alone shows it.
         restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
@@ -140,6 +141,7 @@ class Kind(NamedTuple):
     sensible: Callable[..., bool] | None = None
     needs: Literal["", "joined", "apart"] = ""
     wave: tuple[str, str] | None = None
+    hardly_bent: Callable[..., tuple[tuple[float, ...], ...]] | None = None
     vibrates: Callable[..., float] | None = None
     steady: bool = False
     restoring: bool = False
