@@ -193,7 +193,7 @@ def _given(effect: Effect) -> dict[str, np.ndarray]:
     return {p.name: np.asarray(effect.parameters.get(p.name, p.default), float) for p in every}
 
 
-def _with(of: Hypothesis, every: Sequence[Mapping[str, np.ndarray]]) -> list[Hypothesis]:
+def _with(of: Hypothesis, every: Sequence[Mapping[str, Any]]) -> list[Hypothesis]:
     """The hypothesis with other parameters of its last effect."""
     return [of._replace(effects=(*of.effects[:-1], with_parameters(of.effects[-1], x))) for x in every]
 
