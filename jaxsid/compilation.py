@@ -122,9 +122,8 @@ def compiled_in_full(function: Callable[P, T]) -> Callable[P, T]:
 def _kept_on_disk(function: Callable[P, T], own: dict[str, bool | str | int]) -> Callable[P, T]:
     jitted = eqx.filter_jit(function)
     programs: dict[bytes, _Program] = {}
-    called: dict[
-        Any, _Program
-    ] = {}  # the same by the calls themselves: to name one takes as long as many of them run
+    # the same by the calls themselves: to name one takes as long as many of them run
+    called: dict[Any, _Program] = {}
     _in_memory.extend((programs, called))
 
     @functools.wraps(function)
@@ -166,7 +165,7 @@ def _settings(options: dict[str, bool | str | int]) -> tuple[Any, ...]:
 def _seen(x: Any) -> Any:
     """What is equal for leaves of one program."""
     if not eqx.is_array(x):
-        return type(x), x
+        return type(x), x, repr(x) if isinstance(x, float) else ""  # zero and its negative are equal
     return x.aval if isinstance(x, jax.Array) else (x.shape, x.dtype)
 
 

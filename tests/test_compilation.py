@@ -95,6 +95,28 @@ def test_other_options_shapes_and_types_are_other_programs(folder: Path, matrix:
     assert traces.count == 6
 
 
+def test_a_call_like_one_before_is_not_named_again(
+    folder: Path, matrix: np.ndarray, monkeypatch: pytest.MonkeyPatch
+):
+    traces = Traces()
+    run, named, name = traces.fresh(), [], jaxsid.compilation._key
+    monkeypatch.setattr(jaxsid.compilation, "_key", lambda *x: named.append(x) or name(*x))
+    for scale in (2.0, 3.0, 4.0):
+        got = run(matrix, jnp.asarray(scale), word="kept")[0].values
+        expected = np.linalg.eigvals(scale * matrix)
+        np.testing.assert_allclose(np.sort_complex(got), np.sort_complex(expected), rtol=1e-10)
+    assert (len(named), traces.count) == (1, 1)
+
+
+def test_numbers_that_are_equal_but_not_the_same_are_other_programs(folder: Path):
+    def signed(x, given):
+        return jnp.copysign(x, given) if isinstance(given, float) else x + jnp.asarray(given)
+
+    run, x = compiled(signed), jnp.asarray([3])
+    found = [(float(y[0]), y.dtype.kind) for y in (run(x, given) for given in (0.0, -0.0, 0, 1, 1.0, True))]
+    assert found == [(3.0, "f"), (-3.0, "f"), (3.0, "i"), (4.0, "i"), (3.0, "f"), (4.0, "i")]
+
+
 def test_a_traced_call_goes_through(folder: Path, matrix: np.ndarray):
     run = Traces().fresh()
     scales = jnp.asarray([1.0, 2.0])
