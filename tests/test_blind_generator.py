@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.signal import chirp
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "blind"
 sys.path.insert(0, str(FOLDER))
@@ -461,3 +462,13 @@ def test_what_other_numbers_do_as_well_is_no_gap_however_far_it_shifts_a_mode():
     assert linearized > 1.0 > 0.05 > left
     linearized, left = gaps(systems.Effect("cubic_stiffness", *where, {"coefficient": 3e5}))
     assert left > 0.3 * linearized > 0.3
+
+
+def test_numbers_of_a_narrow_mode_are_found_though_mass_and_stiffness_do_nearly_the_opposite():
+    u = chirp(DT * np.arange(3000), 1.0, DT * 3000, 20.0)
+    narrow = MASS._replace(connections=(systems.Connection("c", ("ground", "b1"), 900.0, 0.15),))
+    shifted = systems.recalibrated_by(narrow, systems.numbers(narrow) * np.array([1.0, 0.999, 1.0]))
+    y = respond(shifted, (), u, before=0, steps=1).y
+    std = 0.01 * y.std(axis=0)
+    by_itself = np.sqrt(np.mean((recalibrate.fitted_start(narrow, u, y).residual / std) ** 2))
+    assert by_itself > 1.0 > 1e-3 > recalibrate.gap_left(narrow, u, y, std)

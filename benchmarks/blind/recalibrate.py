@@ -7,7 +7,9 @@ from plant import plant
 from severity import CHANGE, linear_responses
 from systems import System, numbers, recalibrated_by
 
-ITERATIONS, FURTHEST = 6, 0.3  # relative change of a number in one iteration
+ITERATIONS, FURTHEST = 40, 0.3  # relative change of a number in one iteration
+PARTS = tuple(0.5**i for i in range(9))  # of a step that are tried
+LITTLE = 1e-6  # part of the cost that is not worth a step
 
 
 class Fit(NamedTuple):
@@ -47,19 +49,26 @@ def recalibrated(system: System, u: np.ndarray, y: np.ndarray) -> Fit:
     for _ in range(ITERATIONS):
         values, std = numbers(fit.system), fit.residual.std(axis=0)
         at = np.flatnonzero(values)
-        moved = [values * (1 + CHANGE * (np.arange(len(values)) == i)) for i in at]
-        systems = [fit.system, *(recalibrated_by(system, v) for v in moved)]
-        made = linear_responses(systems, u, np.tile(fit.start, (len(systems), 1)))
+        # mass and stiffness of a narrow mode do nearly the opposite: what else they do needs slopes from both sides
+        moved = [values * (1 + c * (np.arange(len(values)) == i)) for c in (CHANGE, -CHANGE) for i in at]
+        made = linear_responses(
+            [recalibrated_by(system, v) for v in moved], u, np.tile(fit.start, (len(moved), 1))
+        )
         n = len(fit.start)
         free = linear_responses([fit.system] * n, 0 * u, np.eye(n))
-        columns = np.concatenate([(made[1:] - made[0]) / CHANGE, free]) / std
+        columns = np.concatenate([(made[: len(at)] - made[len(at) :]) / (2 * CHANGE), free]) / std
         J = columns.reshape(len(columns), -1).T
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         step = np.linalg.lstsq(J / size, (fit.residual / std).ravel(), rcond=1e-6)[0] / size
         change = np.zeros(len(values))
         change[at] = np.clip(step[: len(at)], -FURTHEST, FURTHEST)
-        tried = fitted_start(recalibrated_by(system, values * np.exp(change)), u, y)
-        if not (tried.residual**2 / std**2).sum() < (fit.residual**2 / std**2).sum() * (1 - 1e-6):
+        cost = (fit.residual**2 / std**2).sum()
+        # a step as long as a mode is narrow may lead past what it leads to
+        for part in PARTS:
+            tried = fitted_start(recalibrated_by(system, values * np.exp(part * change)), u, y)
+            if (tried.residual**2 / std**2).sum() < cost * (1 - LITTLE):
+                break
+        else:
             break
         fit = tried
     return fit
