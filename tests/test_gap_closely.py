@@ -1,6 +1,7 @@
 """Windows of a few samples for laws under which neighbouring motions part at once: snaps from well to well."""
 
 import math
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -168,16 +169,21 @@ def of_one(kind):
     return refit(0.0, hypothesis=Hypothesis((Effect(kind, tuple(B12.items()), {}),)))
 
 
-def followed(monkeypatch, rounds, parts, place=B12, tried=(), kind="cogging_ripple"):
-    """What comes of rounds, each of so many laws taken, so much left by the best one, and its evidence."""
+DOWN = refit(0.0).fit._replace(states=(np.full((1, 6), 7.0),))  # of a fit at its very bottom
+
+
+def followed(monkeypatch, rounds, parts, place=B12, tried=(), kind="cogging_ripple", clear=(True, True)):
+    """What comes of rounds: of each, how many laws are taken, what the best leaves, its evidence, a clear look."""
     look = Look(cast(Any, "fit"), cast(Any, "null"), cast(Any, "scored"))
     origin = Found(BENCH, look, (), (), None)
     law = ranking(0.0, kinds=[(kind, B12)])
     law = law._replace(ranked=(law.ranked[0]._replace(refit=of_one(kind)),))
     ends, begun = [], []
-    for selected, left, evidence in rounds:
+    for (selected, left, evidence), nothing in zip(rounds, clear, strict=False):
         last = law._replace(ranked=(law.ranked[0]._replace(left=left, evidence=evidence),))
-        ends.append(origin._replace(rounds=(last,), selected=last.ranked[:selected], before=refit(0.0)))
+        found = look._replace(null=cast(Any, SimpleNamespace(p_value=float(nothing), share=1.0)))
+        end = origin._replace(look=found, rounds=(last,), selected=last.ranked[:selected])
+        ends.append(end._replace(before=refit(0.0)))
 
     def further(begin, here, *_):
         begun.append((begin, tuple(here)))
@@ -189,6 +195,8 @@ def followed(monkeypatch, rounds, parts, place=B12, tried=(), kind="cogging_ripp
     monkeypatch.setattr(search, "begun_along", lambda bench, of, found: bench._replace(jump=0.2))
     monkeypatch.setattr(search, "again", lambda law, refit: candidate("cogging_ripple", B23))
     monkeypatch.setattr(search, "changes_of", lambda found, bench: np.arange(9.0))
+    monkeypatch.setattr(search, "bench_of", lambda *_, length: BENCH._replace(substeps=length))
+    monkeypatch.setattr(search, "refitted", lambda bench, *_, **__: refit(0.0)._replace(fit=DOWN))
     monkeypatch.setattr(search, "_further", further)
     monkeypatch.setattr(search, "parting", lambda bench, found: PARTED + (1.0 if parts else -1.0))
     candidates = [candidate("cogging_ripple", B12)] * 9
@@ -208,6 +216,26 @@ def test_it_is_taken_where_neighbours_part(monkeypatch, selected, left, taken):
     assert len(here) == search.CLOSELY
     assert begin == origin._replace(bench=BENCH._replace(loose=0.1))
     assert found == ((ends[0], begin) if taken else None)
+
+
+@pytest.mark.parametrize(
+    ("selected", "clear", "taken"),
+    [
+        (1, True, 1),
+        (1, False, 0),  # something is left there, too
+        (0, True, 0),
+    ],
+)
+def test_longer_windows_along_those_tell_what_play_forgives(monkeypatch, selected, clear, taken):
+    rounds = [(1, 1.5, 0.0), (selected, 1.5, 0.0)]
+    origin, ends, begun, found = followed(monkeypatch, rounds, True, clear=(False, clear))
+    begin, tried = begun[1]
+    # from where the law of windows of a few samples leads to in them
+    assert begin == origin._replace(bench=BENCH._replace(substeps=SHORTEST, jump=0.2, states=DOWN.states))
+    assert tried[0].place == B23
+    np.testing.assert_array_equal(tried[0].changes, np.arange(9.0))
+    assert tried[1:] == begun[0][1]
+    assert found == (ends[taken], begun[taken][0])
 
 
 @pytest.mark.parametrize(

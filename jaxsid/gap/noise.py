@@ -2,7 +2,8 @@
 
 In this order: periods of a periodic record, records of equal inputs, a part without input, and else the quietest band
 of what a model leaves. Free decays are taken out of all of them. Motion that does not repeat under a periodic input,
-as in contact, is no noise: where a sensor differs from period to period far more than in another record, that tells.
+as in contact, is no noise: where a sensor differs from period to period far more than in another record, or than its
+quietest band, that tells.
 """
 
 from collections.abc import Iterable, Sequence
@@ -83,23 +84,29 @@ def noise_of(model: LumpedModel, records: Sequence[Record]) -> tuple[Noise, ...]
     require(len(records) > 0, "give at least one record.")
     found = [_of_record(model, r, [x for x in records if x is not r]) for r in records]
     every = list(zip(found, records, strict=True))
-    like = [_as_elsewhere(n, model, r, every) for n, r in every]
+    like = [_unless_motion(n, model, r, every) for n, r in every]
     return tuple(_at_least(n, model, r) for n, r in zip(like, records, strict=True))
 
 
-def _as_elsewhere(
+def _unless_motion(
     noise: Noise, model: LumpedModel, record: Record, every: Iterable[tuple[Noise, Record]]
 ) -> Noise:
     """What does not repeat in a record, if it is noise; else that of the quietest other one, sampled alike.
 
     Noise may well be louder in one record, of a sensor in another range, but is hardly a large part of what it reads.
+    Where none of them repeats, as in chaos, nothing but the quietest band is left to tell.
     """
     others = [n for n, r in every if n.degrees > 0 and np.isclose(float(r.dt), float(record.dt))]
     large = noise.rms() > LARGE_PART * _signal_rms(model, record)
+    if noise.degrees <= 0 or not large.any():
+        return noise
     louder = lambda n: float(np.where(large, noise.rms() / n.rms(), 0.0).max(initial=0.0))  # noqa: E731
     quietest = max(others, key=louder, default=noise)
-    same = np.isfinite(noise.level) == np.isfinite(quietest.level)
-    return quietest if noise.degrees > 0 and louder(quietest) > UNLIKE and same.all() else noise
+    for other in (quietest, floor(spectra_of(model, record))):
+        same = np.isfinite(noise.level) == np.isfinite(other.level)
+        if louder(other) > UNLIKE and same.all():
+            return other
+    return noise
 
 
 def _at_least(noise: Noise, model: LumpedModel, record: Record) -> Noise:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsid.gap.closely import PARTED, begun_along, closely, parting, tightened
+from jaxsid.gap.closely import PARTED, SLOWLY, begun_along, closely, parting, tightened
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.explain import (
     ALONE,
@@ -63,6 +63,7 @@ from jaxsid.gap.refit import (
 )
 from jaxsid.gap.screen import Candidate, unseen
 from jaxsid.gap.sliding import sliding
+from jaxsid.gap.windows import SHORTEST
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
 
@@ -198,7 +199,7 @@ def _followed(
     law, told = at.selected[-1], not loud(at.rounds[-1])
     # neighbours part under laws that bend alone; short windows forgive a linear one what it lacks
     if told and not law.refit.hypothesis.linear and parting(at.bench, law.refit) > PARTED:
-        return at, begin
+        return (at, begin) if at.look.clear else _longer(at, origin, here, model, seen, say) or (at, begin)
     if not told and law.key in {x.key for x in tried.selected}:
         return None
     usual = origin._replace(bench=begun_along(origin.bench, at.bench, law.refit))
@@ -210,6 +211,30 @@ def _followed(
     # a law under which the motion may leave for good where it errs is told by short windows alone
     held = any(x.key == law.key and math.isfinite(x.evidence) for x in new.rounds[-1].ranked)
     return (at, begin) if told and not held else None
+
+
+def _longer(
+    at: Found,
+    origin: Found,
+    here: tuple[Candidate, ...],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> tuple[Found, Found] | None:
+    """Windows that stand alone and begin along those of a few samples, if tests find nothing in what they leave.
+
+    Those may be corrected from one to the next, so that a law a little off leaves no more in them than the true one.
+    """
+    say("in longer windows, along them")
+    last, law = at.selected[-1], at.selected[-1].refit
+    longer = bench_of(model, seen, origin.bench.guesses, origin.look.fit, length=SHORTEST)
+    longer = begun_along(longer, at.bench, law)
+    # to the very bottom before noise is weighed anew: it would take up what a law a little off leaves
+    along = refitted(longer, law.hypothesis, changes=changes_of(law, at.bench), steps=SLOWLY)
+    begin = origin._replace(bench=longer._replace(states=along.fit.states))
+    own = again(last, along)._replace(changes=changes_of(along, longer))
+    new = _further(begin, (own, *here), FIRST, model, seen, say)
+    return (new, begin) if new.selected and new.look.clear else None
 
 
 def _elsewhere(
