@@ -30,6 +30,7 @@ from jaxsid.gap.refit import Hypothesis, in_windows, refitted
 from jaxsid.gap.roughly import ALIKE, HERE, NEARLY, SIZES, loudest, roughly
 from jaxsid.gap.search import Found, _otherwise
 from jaxsid.gap.windows import BLOCKS
+from jaxsid.mechanics.lumped import Effect
 
 B13 = {"between": ("b1", "b3")}
 LAWS = ["backlash", "end_stop", "hysteresis", "cubic_stiffness", "quadratic_damping", "quadratic_stiffness"]
@@ -247,8 +248,8 @@ def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):
     assert ("hysteresis", ("b1", "b3")) not in fitted
 
 
-@pytest.mark.parametrize("diverging", [0, 4])
-def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypatch, diverging):
+def round_of(monkeypatch, effort, worse, outcome, without):
+    """Numbers of a round's thorough fits, each far worse than it seemed, the first few diverging; values compared."""
     every = [
         (candidate("cogging_ripple", {"between": (f"x{i}", "y")}), Hypothesis(), None) for i in range(30)
     ]
@@ -256,7 +257,7 @@ def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypa
 
     def whole(bench, hypothesis, start, effort):
         thorough.append(len(thorough))
-        return Whole(BENCH, refit(-math.inf if len(thorough) <= diverging else -1e5 - len(thorough)))
+        return Whole(BENCH, refit(-math.inf if len(thorough) <= worse else -1e5 - len(thorough)))
 
     patches = {
         "loudest": lambda bench, without: bench,
@@ -271,16 +272,46 @@ def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypa
         "side_by_side": lambda f, xs: [f(x) for x in xs],
         "changes_of": lambda found, bench: None,
         "value": lambda found, bench: found.fit.evidence,
-        "_compared": lambda rough, values, *_: compared.append(values) or ranking(0.0),
+        "_compared": lambda rough, values, *_: compared.append(values) or outcome,
     }
     for name, instead in patches.items():
         monkeypatch.setattr(explain, name, instead)
-    explain._round(BENCH, every, refit(0.0), explain.FURTHER, silent)
-    (values,) = compared
+    explain._round(BENCH, every, without, effort, silent)
+    return thorough, compared
+
+
+@pytest.mark.parametrize("diverging", [0, 4])
+def test_those_after_many_that_turn_out_worse_are_not_fitted_thoroughly(monkeypatch, diverging):
+    thorough, (values,) = round_of(monkeypatch, explain.FURTHER, diverging, ranking(0.0), refit(0.0))
     # what diverges at once costs nothing, and does not count
     assert len(thorough) == explain.FURTHER.refined + explain.MORE + diverging
     assert int(np.argmax(values)) == diverging
     assert values[-1] < values[diverging]
+
+
+BESIDE = refit(0.0, hypothesis=Hypothesis((Effect("backlash", tuple(B12.items()), {"half_gap": 1.0}),)))
+WORTHLESS = ranking(0.0, without=0.0)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "without", "more"),
+    [
+        (WORTHLESS, refit(0.0), explain.SECOND),
+        (ranking(0.0), refit(0.0), 0),  # one is worth it
+        (WORTHLESS, BESIDE, 0),  # something was found before
+        (
+            WORTHLESS._replace(ranked=(WORTHLESS.ranked[0]._replace(left=9.0),)),
+            refit(0.0),
+            0,
+        ),  # loud: no law is right
+    ],
+)
+def test_where_none_is_worth_anything_more_are_fitted_thoroughly(monkeypatch, outcome, without, more):
+    thorough, compared = round_of(monkeypatch, explain.FIRST, 0, outcome, without)
+    assert len(thorough) == explain.FIRST.refined + explain.MORE + more
+    assert len(compared) == 1 + (more > 0)
+    # each of them counts for what it is, not for what it seemed
+    assert sum(x <= -1e5 for x in compared[-1]) >= len(thorough)
 
 
 def test_a_round_without_candidates_has_no_fits(tried):
