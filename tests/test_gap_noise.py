@@ -63,6 +63,15 @@ def test_repeated_records():
     np.testing.assert_allclose([n.level for n in noises], LEVEL, rtol=0.1)
 
 
+def test_drift_without_input_is_noise_however_large():
+    u = np.concatenate([np.zeros(1000), drive(1000)])
+    drift = coloured((2000, 3), pole=0.98)
+    y = exact(u) + drift * exact(u).std(axis=0) / drift.std(axis=0)
+    (noise,) = noise_of(chain(), [record(u, y)])
+    assert noise.source == "quiet part"
+    assert (noise.rms() > 0.4 * exact(u).std(axis=0)).all()
+
+
 def test_quiet_part():
     u = np.concatenate([np.zeros(400), drive(1000)])
     (noise,) = noise_of(chain(), [record(u, exact(u) + coloured((1400, 3)))])

@@ -94,7 +94,7 @@ def _unless_motion(
     """What does not repeat in a record, if it is noise; else that of the quietest other one, sampled alike.
 
     Noise may well be louder in one record, of a sensor in another range, but is hardly a large part of what it reads.
-    Where none of them repeats, as in chaos, nothing but the quietest band is left to tell.
+    Where none of them repeats, as in chaos, nothing but the quietest band is left to tell; without input nothing moves.
     """
     others = [n for n, r in every if n.degrees > 0 and np.isclose(float(r.dt), float(record.dt))]
     large = noise.rms() > LARGE_PART * _signal_rms(model, record)
@@ -102,7 +102,8 @@ def _unless_motion(
         return noise
     louder = lambda n: float(np.where(large, noise.rms() / n.rms(), 0.0).max(initial=0.0))  # noqa: E731
     quietest = max(others, key=louder, default=noise)
-    for other in (quietest, floor(spectra_of(model, record))):
+    bands = [] if noise.source == SOURCES[2] else [floor(spectra_of(model, record))]
+    for other in (quietest, *bands):
         same = np.isfinite(noise.level) == np.isfinite(other.level)
         if louder(other) > UNLIKE and same.all():
             return other
