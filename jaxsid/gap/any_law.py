@@ -174,12 +174,16 @@ def _without_states(
     unknowns: int,
     deviations: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "m m"]:
-    """Products of unknowns, columns and what is left, the initial state of each window out of the way first."""
+    """Products of unknowns, columns and what is left, the initial state of each window out of the way first.
+
+    Of what is left rather than differences of products: without noise states take up all but rounding.
+    """
     own = rows[..., unknowns:-1]
     rest = np.concatenate([rows[..., :unknowns], columns, rows[..., -1:]], axis=2)
     turned = own.transpose(0, 2, 1)
     inner = turned @ own + np.diag(1 / deviations**2)
     scale = 1 / np.sqrt(np.diagonal(inner, axis1=1, axis2=2))
     across = scale[:, :, None] * (turned @ rest)
-    away = np.linalg.solve(inner * scale[:, :, None] * scale[:, None, :], across)
-    return (rest.transpose(0, 2, 1) @ rest - across.transpose(0, 2, 1) @ away).sum(axis=0)
+    by_states = scale[:, :, None] * np.linalg.solve(inner * scale[:, :, None] * scale[:, None, :], across)
+    left, likely = rest - own @ by_states, by_states / deviations[:, None]
+    return (left.transpose(0, 2, 1) @ left + likely.transpose(0, 2, 1) @ likely).sum(axis=0)
