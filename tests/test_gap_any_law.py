@@ -13,7 +13,7 @@ from gap_helpers import DT, JOINT, SENSED, chain, drive, record, silent
 from test_gap_verdict import causes, closure, examination, ranking
 
 from jaxsid import diagnose
-from jaxsid.gap.any_law import any_law, smooth_places
+from jaxsid.gap.any_law import _without_states, any_law, smooth_places
 from jaxsid.gap.causes import _doubted, _unlisted
 from jaxsid.gap.f_test import f_test
 from jaxsid.gap.look import Look
@@ -284,3 +284,20 @@ def test_a_law_beside_which_another_is_sure_is_not_in_the_catalogue():
     assert "cubic stiffness between b2 and b1" in reason
     assert "another shape" in reason
     assert about_doubt(found, sure) == []
+
+
+def test_what_states_take_up_leaves_no_negative_squares():
+    """Rounding is all that is left of them; of all else what least squares leave, states' likely sizes in rows."""
+    rng = np.random.default_rng(3)
+    states, taken = rng.normal(size=(6, 40, 4)), rng.normal(size=(6, 4, 5))
+    columns, last = 1e8 * states @ taken, states @ rng.normal(size=(6, 4, 1))
+    unknowns, deviations = rng.normal(size=(6, 40, 2)), np.full(4, 1e9)
+    gram = _without_states(np.concatenate([unknowns, states, last], axis=2), columns, 2, deviations)
+    assert (np.diag(gram) >= 0).all()
+    left = 0.0
+    for own, x in zip(states, unknowns, strict=True):
+        a = np.concatenate([own, np.diag(1 / deviations)])
+        b = np.concatenate([x, np.zeros((4, 2))])
+        rest = b - a @ np.linalg.lstsq(a, b, rcond=None)[0]
+        left = left + rest.T @ rest
+    np.testing.assert_allclose(gram[:2, :2], left, rtol=1e-10)
