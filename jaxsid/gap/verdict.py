@@ -27,6 +27,7 @@ LAPSE = 0.02  # share of cases of the fifth test set in which what explains all,
 # likewise where tests find more than noise in what it leaves, and that is over so much of what the linear model does
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
+SPARED = 0.1  # part of what tests found, of those that were seen, from which on an effect does nothing there
 OTHER = (
     0.9  # likewise of laws that one of another shape surely adds to, 19 of 22, one of the others found since
 )
@@ -81,7 +82,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
         return Verdict("none", {"none": 1 - some, "effect": some, "unknown": 0.0}, ())
     pairs = _at_one_place(causes.selected)
     imitating = _imitating(pairs)
-    unexplained, twofold = _unexplained(causes, found.finding), IMITATED if imitating else TWOFOLD
+    unexplained, twofold = _unexplained(causes, found), IMITATED if imitating else TWOFOLD
     paired = pairs[0] if pairs and twofold > unexplained else ()
     unexplained = twofold if paired else unexplained
     if other := _instead_of_another(causes):
@@ -94,7 +95,7 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     return Verdict("ambiguous" if open_ones else "effect", probability, likely, paired=paired)
 
 
-def _unexplained(causes: Causes, finding: str) -> float:
+def _unexplained(causes: Causes, found: Examination) -> float:
     """Probability that the law is not among those tried: by how much of the gap the best one leaves.
 
     Beside the best linear model only where tests find more than it explains: what that leaves of other samples, near a
@@ -104,20 +105,22 @@ def _unexplained(causes: Causes, finding: str) -> float:
     if not causes.selected and causes.chosen is not causes.recalibrated:
         return 1 - MISSED
     # what comes nearest to a law that is not there explains most of its gap, but not to the noise
-    structure = finding == "structure"
+    structure = found.finding == "structure"
     # where tests find nothing in what was seen, numbers a little off show in a run over what was not
     bare = bool(causes.selected) and causes.places is None
     more = structure and last.after > (CLEAR if bare else SURE) * last.noise_floor
-    beyond = more or (finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
+    beyond = more or (found.finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     # real friction and hysteresis are richer than any law of theirs, which counts where it explains most
     rough = any(CATALOGUE[x.kind].rubs for x in causes.selected)
-    gone = last.against_recalibrated if beyond else last.fraction
+    # nor do they then tell against a law that explains those
+    told = (last, causes.seen) if bare and not more else (last,)
+    gone = max(c.against_recalibrated if beyond else c.fraction for c in told)
     enough = MORE if more and not rough else ENOUGH
     lapse = LAPSE
     if structure and not more and causes.places is not None and last.after > SHRUNK * last.recalibrated:
         # noise whose level is guessed takes up what no law explains, so that nearly all seems gone
         idle = causes.bounded and last.after > HARDLY * last.recalibrated
-        lapse = USELESS if idle else REMAINDER
+        lapse = USELESS if idle and causes.remaining.share > SPARED * found.null.share else REMAINDER
     return float(lapse + (1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
 
 
