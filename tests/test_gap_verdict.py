@@ -212,6 +212,10 @@ def test_other_samples_tell_little_against_a_law_that_explains_all_of_those_seen
         found._replace(closures=(far,)),
     )
     assert [verdict_of(examination(), x).name for x in other] == ["unknown"] * 3
+    # numbers that explain the samples seen, but not others, are none
+    seen, others = closure(0.0126, 0.0126, 0.01256, 0.0472), closure(0.03, 0.03, 0.01004, 0.0332)
+    apart = causes(ranking(0.0, -500.0), closures=[others], seen=seen)
+    assert verdict_of(examination(finding="parameters"), apart).name == "unknown"
 
 
 def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_rest(monkeypatch):
