@@ -20,7 +20,7 @@ from jaxsid.gap.null import SIGNIFICANT, Null, found_part
 from jaxsid.gap.places import Place
 from jaxsid.gap.ranking import ERRORS, WORTH, Explanation, Ranking, ends_of
 from jaxsid.gap.refit import Bench, Hypothesis, Refit, changes_of, refitted
-from jaxsid.gap.search import searched
+from jaxsid.gap.search import Found, searched, small_beside
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
 
@@ -117,13 +117,18 @@ def causes_of(
     """
     say = progress or (lambda text: None)
     at = searched(model, seen, found, say)
+    unlisted = _unlisted(at, found, say)
+    if unlisted and at.look.clear:
+        # what another effect leaves is shown by laws of any shape, too, wherever they are asked
+        at = small_beside(at, model, seen, say)
+        unlisted = _unlisted(at, found, say)
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before
     linear = best_linear(bench, changes_of(chosen, bench))
     if found.finding == "parameters" and (not selected or _beyond(linear, chosen, rounds[-1].scale)):
         chosen, selected = linear, []
-    unlisted = _unlisted(bench, look, selected, say) if _doubted(found, look, selected) else ()
+    unlisted = unlisted if selected else ()
     say("how far the gap shrinks")
     ends = tuple(len(r.y) for r in seen)
     tried = _Tried(found, bench, look, linear, chosen, [x.refit for x in selected])
@@ -206,22 +211,20 @@ def _doubted(found: Examination, look: Look, selected: Sequence[Explanation]) ->
     return look.null.p_value < SIGNIFICANT or (linear and found.finding == "structure")
 
 
-def _unlisted(
-    bench: Bench, look: Look, selected: Sequence[Explanation], say: Callable[[str], None]
-) -> tuple[Place, ...]:
+def _unlisted(at: Found, found: Examination, say: Callable[[str], None]) -> tuple[Place, ...]:
     """Places of laws found at which a law of another shape surely explains more.
 
     Windows of a few samples forgive what would tell. What more probably arises elsewhere is for another effect.
     """
-    if not selected or np.isfinite(bench.loose):
+    if at.before is None or not _doubted(found, at.look, at.selected) or np.isfinite(at.bench.loose):
         return ()
-    places, at = smooth_places(selected), look.scored
-    if at is not None:
-        likely = {ends_of(p.as_dict()) for p in located(at).likely}
+    places, scored = smooth_places(at.selected), at.look.scored
+    if scored is not None:
+        likely = {ends_of(p.as_dict()) for p in located(scored).likely}
         places = tuple(p for p in places if ends_of(p.as_dict()) in likely)
     if places:
         say("laws of any shape")
-    return tuple(p for p in places if any_law(bench, selected[-1].refit, p).p_value < SURELY)
+    return tuple(p for p in places if any_law(at.bench, at.before, p).p_value < SURELY)
 
 
 def _beyond(linear: Refit, chosen: Refit, scale: float) -> bool:

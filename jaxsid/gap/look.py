@@ -11,9 +11,9 @@ import numpy as np
 from jaxsid.gap.deflate import deflated
 from jaxsid.gap.examine import NEGLIGIBLE, Examination
 from jaxsid.gap.locate import Scored, likeliest, scored
-from jaxsid.gap.null import SIGNIFICANT, Null, left_share, null_test
+from jaxsid.gap.null import SIGNIFICANT, Null, left_share, null_test, told_at
 from jaxsid.gap.places import places_of
-from jaxsid.gap.ranking import LOUD, ends_of
+from jaxsid.gap.ranking import LOUD, Explanation, ends_of
 from jaxsid.gap.recalibrate import Recalibrated, recalibrated
 from jaxsid.gap.refit import Bench, Refit
 from jaxsid.gap.screen import Candidate, screen
@@ -63,6 +63,20 @@ def candidates_of(look: Look) -> tuple[Candidate, ...]:
         look: none come of a clear one.
     """
     return () if look.clear else _screened(look, None)
+
+
+def candidates_elsewhere(look: Look, selected: Sequence[Explanation]) -> tuple[Candidate, ...]:
+    """Likewise, of a clear look too, where tests find a law but nothing was found yet.
+
+    Args:
+        look: at places.
+        selected: what was found.
+    """
+    if look.scored is None:
+        return ()
+    told = {ends_of(p.as_dict()) for p in told_at(look.null, look.scored.places)}
+    told -= {ends_of(x.place) for x in selected}
+    return tuple(c for c in _screened(look, None) if ends_of(c.place) in told)
 
 
 def attached_candidates(look: Look) -> tuple[Candidate, ...]:
@@ -146,7 +160,9 @@ def varied(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     return tuple(candidates[i] for i in order)
 
 
-def looked(model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refit) -> Look:
+def looked(
+    model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refit, *, little: bool = False
+) -> Look:
     """Records without what effects found do to them, beside the model with its wrong numbers put right.
 
     Args:
@@ -154,6 +170,7 @@ def looked(model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refi
         seen: records that may be looked at.
         bench: that the fit is of.
         found: the fit.
+        little: places are asked for though the look is clear.
     """
     nominal = np.asarray(element_matrices(bench.model).nominal)
     change = np.zeros(len(nominal))
@@ -163,4 +180,8 @@ def looked(model: LumpedModel, seen: Sequence[Record], bench: Bench, found: Refi
     records = deflated(seen, bench, found)
     fit = recalibrated(base, records, bench.noises, wide=True, given=True)
     look = Look(fit, null_test(fit, places_of(base), deflated=True), None)
-    return look if look.clear else look._replace(scored=scored(base, records, noises=bench.noises))
+    return (
+        look
+        if look.clear and not little
+        else look._replace(scored=scored(base, records, noises=bench.noises))
+    )

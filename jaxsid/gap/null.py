@@ -103,6 +103,18 @@ def null_test(fit: Recalibrated, places: Sequence[Place], *, deflated: bool = Fa
     return Null(min(1.0, worst.p_value * len(tests)), share, tuple(tests), relative)
 
 
+def told_at(null: Null, places: Sequence[Place]) -> tuple[Place, ...]:
+    """Places at which a law was found.
+
+    Args:
+        null: tests.
+        places: that these were asked of.
+    """
+    return tuple(
+        p for p, t in zip(places, null.tests, strict=False) if t.p_value * len(null.tests) < SIGNIFICANT
+    )
+
+
 def _beyond(test: Test, carried: float) -> Test:
     """What a test finds beyond what noise of the inputs may give it: as good as chance where that is all."""
     if 0 < test.share <= carried:

@@ -28,6 +28,7 @@ from jaxsid.gap.look import (
     Look,
     at_likeliest,
     attached_candidates,
+    candidates_elsewhere,
     candidates_of,
     looked,
     slight,
@@ -141,6 +142,23 @@ def searched(
     lacking = attached_candidates(start.look)[:LACKING]
     off = _numbers(alone, lacking, model, seen, say)
     return off if off.selected or not structure else at
+
+
+def small_beside(at: Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> Found:
+    """With one effect more that acts elsewhere, if one is worth it, however little of the response it is.
+
+    Args:
+        at: something was found, which leaves a clear look.
+        model: nominal.
+        seen: records that may be looked at.
+        say: called with a line of text as each stage begins.
+    """
+    if at.before is None or len(at.selected) >= MOST_EFFECTS:
+        return at
+    look = looked(model, seen, at.bench, at.before, little=True)
+    candidates = candidates_elsewhere(look, at.selected)
+    more = _further(at._replace(look=look), candidates, FURTHER, model, seen, say)
+    return at if len(more.selected) == len(at.selected) else _reconsidered(more, model, seen, say)
 
 
 def _effects(at: Found, model: LumpedModel, seen: Sequence[Record], say: Callable[[str], None]) -> Found:
