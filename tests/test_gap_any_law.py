@@ -52,10 +52,10 @@ def fitted_to(y, level, hypothesis=CUBIC):
     return of, refitted(of, hypothesis)
 
 
-def left(p_value, scored, loose=np.inf, selected=(), share=0.1):
+def left(p_value, scored, loose=np.inf, selected=()):
     """How far a search has come, and a look at what is left."""
     of = Bench(**dict.fromkeys(Bench._fields))._replace(loose=loose)
-    return Found(of, Look(None, Null(p_value, share, (), ()), scored), (), tuple(selected), SimpleNamespace())
+    return Found(of, Look(None, Null(p_value, 0.1, (), ()), scored), (), tuple(selected), SimpleNamespace())
 
 
 def least_squares(columns, y):
