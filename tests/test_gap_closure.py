@@ -9,12 +9,14 @@ from gap_helpers import DT, SAMPLES, chain, drive, exact, record
 import jaxsid
 from jaxsid.gap import closure as module
 from jaxsid.gap.closure import (
+    SPREAD,
     Left,
     _run_on,
     closure_of,
     fraction,
     left_before,
     left_of,
+    spread_of,
 )
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
@@ -238,3 +240,49 @@ def test_windows_begin_anew():
     free, windows = (np.sqrt((left_of(*given, windowed=x).left[0] ** 2).mean(axis=0)) for x in (False, True))
     assert (windows < 0.98 * free).all()
     assert (windows > 2 * known(level).rms()).all()
+
+
+def test_runs_part_as_far_as_what_is_not_known_of_the_numbers_makes_them():
+    """The error of runs over unseen samples, next to what noise-free ones would be, is what the deviations say."""
+    u = drive(4 * SAMPLES)
+    truth = exact(u)
+    ratios = []
+    for seed in range(8):
+        y, level = colored(truth, seed)
+        fit_to = bench(y[: 3 * SAMPLES], level, u=u[: 3 * SAMPLES])
+        found = refitted(fit_to, Hypothesis())
+        data = record(u, y)
+        left = left_of(found, fit_to, [data], [3 * SAMPLES], windowed=False)
+        spread = spread_of(found, fit_to, [data], left)
+        assert spread.measured is left.measured
+        error = left.left[0] + y[3 * SAMPLES :] - truth[3 * SAMPLES :]
+        ratios.append((error**2).mean(axis=0) / (spread.left[0] ** 2).mean(axis=0))
+    assert 0.4 < np.mean(ratios) < 2.5
+
+
+def test_what_is_not_known_of_one_number_parts_runs_along_its_slope(of):
+    u = drive(2 * SAMPLES)
+    y, _ = colored(exact(u), 0)
+    hidden = np.where([True, True, False], 0.0, np.nan)
+    found, step, which = refitted(of, Hypothesis()), 1e-4, 4
+    given = of, [record(u, y + hidden)], [SAMPLES]
+
+    def left(change):
+        theta = found.fit.theta + change * np.eye(len(found.fit.theta))[which]
+        return left_of(found._replace(fit=found.fit._replace(theta=theta)), *given, windowed=False)
+
+    slope = (left(step).left[0] - left(-step).left[0]) / (2 * step)
+    alone = np.zeros_like(found.fit.covariance)
+    alone[which, which] = step**2
+    of_one = found._replace(fit=found.fit._replace(covariance=alone))
+    spread = spread_of(of_one, of, given[1], left(0.0)).left[0]
+    size = np.sqrt(np.mean(np.random.default_rng(0).standard_normal((SPREAD, len(alone)))[:, -1] ** 2))
+    np.testing.assert_allclose(
+        spread, size * step * np.abs(slope), rtol=0.02, atol=0.01 * step * np.nanstd(slope)
+    )
+    np.testing.assert_array_equal(np.isnan(spread), [[False, False, True]] * SAMPLES)
+    # and counts in the closure as all else does
+    lefts = left(0.0), left(0.0), left(0.0)
+    closed = closure_of(*lefts, [known(np.array([0.1, 0.1, np.nan]))], ["a", "b", "c"], spread=lefts[2])
+    assert closed.unsure == pytest.approx(closed.after)
+    assert "unsure" not in closed.as_dict()

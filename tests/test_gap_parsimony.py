@@ -125,9 +125,9 @@ def test_the_best_law_stays_where_simpler_ones_leave_much_more(simpler):
 def taken(monkeypatch):
     """What is taken of a round that Stribeck's law won, where more is left and simpler laws are as told."""
 
-    def run(plain, clear=False, selected=(), diverging=()):
+    def run(plain, clear=False, selected=(), diverging=(), most=1.0, p_value=0.0):
         first = misfit((*STRIBECK, 11.5))
-        look = SimpleNamespace(clear=clear)
+        look = SimpleNamespace(clear=clear, null=SimpleNamespace(p_value=p_value))
 
         def take(self, of):
             best = of.ranked[0]
@@ -137,7 +137,7 @@ def taken(monkeypatch):
         monkeypatch.setattr(Found, "taken", take)
         monkeypatch.setattr(search, "looked", lambda *_: look)
         monkeypatch.setattr(search, "rank", lambda *_: first)
-        monkeypatch.setattr(search, "worth", lambda of, least: True)
+        monkeypatch.setattr(search, "worth", lambda of, least: least < most)
         monkeypatch.setattr(search, "_least", lambda look: 0.0)
         monkeypatch.setattr(search, "plainer", lambda *_: plain)
         at = Found(BENCH, look, (), selected, refit(0.0) if selected else None)
@@ -173,3 +173,20 @@ def test_a_further_law_that_leaves_hardly_less_is_refused(taken):
     at, found = taken(misfit((*STRIBECK, 90.0)), selected=known)
     assert found.selected == at.selected
     assert len(taken(misfit((*STRIBECK, 30.0)), selected=known)[1].selected) == 2
+
+
+def test_a_further_law_that_is_little_is_taken_elsewhere_if_tests_find_nothing_beside_it(taken):
+    there = misfit(("constant_load", {"body": "b3"}, 0.0, 20.0)).ranked
+    plain = misfit((*STRIBECK, 30.0))
+
+    def count(**given):
+        return len(
+            taken(plain, **{"clear": True, "most": search.LEAST, "selected": there, **given})[1].selected
+        )
+
+    assert count(p_value=0.3) == 2
+    assert count(p_value=1e-4) == 1
+    assert count(p_value=0.3, selected=misfit(("constant_load", B12, 0.0, 20.0)).ranked) == 1
+    assert count(p_value=0.3, most=0.0) == 1
+    # one that is not little may leave something for others
+    assert count(p_value=1e-4, most=1.0) == 2

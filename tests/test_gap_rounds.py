@@ -248,23 +248,26 @@ def test_the_simpler_law_is_found_where_the_best_one_makes_no_sense(tried):
     assert ("hysteresis", ("b1", "b3")) not in fitted
 
 
-def round_of(monkeypatch, effort, worse, outcome, without):
-    """Numbers of a round's thorough fits, each far worse than it seemed, the first few diverging; values compared."""
-    every = [
-        (candidate("cogging_ripple", {"between": (f"x{i}", "y")}), Hypothesis(), None) for i in range(30)
-    ]
+def round_of(monkeypatch, effort, worse, outcome, without, led_away=()):
+    """Where a round's thorough fits begin, each far worse than it seemed, the first few diverging; values compared.
+
+    Rough fits of those led away come last.
+    """
+    begin = [Hypothesis((Effect("cogging_ripple", (), {"amplitude": float(i)}),)) for i in range(30)]
+    every = [(candidate("cogging_ripple", {"between": (f"x{i}", "y")}), h, None) for i, h in enumerate(begin)]
     thorough, compared = [], []
 
     def whole(bench, hypothesis, start, effort):
-        thorough.append(len(thorough))
+        thorough.append(hypothesis)
         return Whole(BENCH, refit(-math.inf if len(thorough) <= worse else -1e5 - len(thorough)))
 
     patches = {
         "loudest": lambda bench, without: bench,
         "alone": lambda part, without: refit(-1e9),
-        "roughly": lambda part, every, without, tried, say: [
-            (c, refit(-10.0 * i)) for i, (c, *_) in enumerate(every)
-        ],
+        "roughly": lambda part, every, without, tried, say: sorted(
+            ((c, refit(-10.0 * i - 1000.0 * (i in led_away))) for i, (c, *_) in enumerate(every)),
+            key=lambda x: -x[1].fit.evidence,
+        ),
         "_whole": whole,
         "_values": lambda rough, done, *_: [
             done[i].refit.fit.evidence if i in done else r.fit.evidence for i, (_, r) in enumerate(rough)
@@ -312,6 +315,20 @@ def test_where_none_is_worth_anything_more_are_fitted_thoroughly(monkeypatch, ou
     assert len(compared) == 1 + (more > 0)
     # each of them counts for what it is, not for what it seemed
     assert sum(x <= -1e5 for x in compared[-1]) >= len(thorough)
+
+
+def test_beside_an_effect_those_that_a_part_led_away_begin_as_they_were_screened(monkeypatch):
+    thorough, compared = round_of(monkeypatch, explain.FURTHER, 0, WORTHLESS, BESIDE, led_away=(1, 2, 5))
+    usual = explain.FURTHER.refined + explain.MORE
+    # of the first three that are screened two were not fitted to all, and begin where the screening has them
+    assert [h.effects[0].parameters["amplitude"] for h in thorough[usual:]] == [1.0, 2.0]
+    assert not any(h.effects for h in thorough[:usual])
+    assert len(compared) == 2
+    # what is known of all others is less than of the best of them
+    best = max(x for x in compared[-1] if x <= -1e5)
+    assert max(x for x in compared[-1]) == best
+    # not where one is worth it, nor for a first effect
+    assert len(round_of(monkeypatch, explain.FURTHER, 0, ranking(0.0), BESIDE, led_away=(1, 2))[0]) == usual
 
 
 def test_a_round_without_candidates_has_no_fits(tried):

@@ -212,6 +212,12 @@ def test_other_samples_tell_little_against_a_law_that_explains_all_of_those_seen
         found._replace(closures=(far,)),
     )
     assert [verdict_of(examination(), x).name for x in other] == ["unknown"] * 3
+    # unless its numbers, known no better, would leave as much of them
+    spread = [far._replace(unsure=far.noise_floor * x) for x in (0.55, 0.05)]
+    assert [verdict_of(examination(), found._replace(closures=(x,))).name for x in spread] == [
+        "effect",
+        "unknown",
+    ]
     # numbers that explain the samples seen, but not others, are none
     seen, others = closure(0.0126, 0.0126, 0.01256, 0.0472), closure(0.03, 0.03, 0.01004, 0.0332)
     apart = causes(ranking(0.0, -500.0), closures=[others], seen=seen)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsid.gap.any_law import any_law, smooth_places
 from jaxsid.gap.closely import motions_to_begin
-from jaxsid.gap.closure import Closure, Left, closure_of, left_before, left_of, shown
+from jaxsid.gap.closure import Closure, Left, closure_of, left_before, left_of, shown, spread_of
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.hypothesis import FIXED
 from jaxsid.gap.later import best_linear, later_than_effects, later_than_linear
@@ -198,7 +198,10 @@ def _shrunk(tried: _Tried, whole: Sequence[Record], ends: tuple[int, ...]) -> _S
     refuted = REFUTED if motions is None else 0.0
     floor = tuple(no_louder(n, x, refuted) for n, x in zip(told, steps[-1].left, strict=True))
     names = [s.name for s in bench.model.sensors]
-    *each, alone = (closure_of(*before, x, floor, names) for x in (*steps, before[1]))
+    # where each window begins anew what the numbers lack is taken up by states
+    spread = None if windowed or not look.clear else spread_of(tried.chosen, bench, whole, steps[-1])
+    *each, alone = (closure_of(*before, x, floor, names) for x in (*steps[:-1], before[1]))
+    each.append(closure_of(*before, steps[-1], floor, names, spread=spread))
     first, straight, after = (left_before(x, bench) for x in (nominal, tried.linear, tried.chosen))
     least = [no_louder(n, x, refuted) for n, x in zip(told, after.left, strict=True)]
     same = closure_of(first, straight, after, least, names)

@@ -20,6 +20,7 @@ from jaxsid.records import Record
 
 PIECES = 40  # that what is left is cut into for the interval
 DRAWS = 2000  # of pieces
+SPREAD = 16  # draws of a model's numbers
 ROUNDS = 8  # of the search for initial states
 CLEAR = 1.5  # a gap over the noise floor from which on more than noise is left
 SHOWN = 0.25  # power of a gap next to that of noise, from which on samples show it
@@ -51,6 +52,7 @@ class Closure(NamedTuple):
         against_recalibrated: the fraction of the best linear model's gap.
         by_sensor: NRMSE of the chosen model.
         noise_by_sensor: that of noise alone.
+        unsure: NRMSE that the deviations of the chosen model's numbers alone would give; 0 where nobody asked.
     """
 
     before: float
@@ -62,6 +64,7 @@ class Closure(NamedTuple):
     against_recalibrated: float
     by_sensor: dict[str, float]
     noise_by_sensor: dict[str, float]
+    unsure: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""
@@ -151,6 +154,32 @@ def left_before(found: Refit, bench: Bench) -> Left:
         measured[int(b.record[0])].append(_judged(b, b.y) + mask)
     windows = tuple(_length(bench) * m.dt for m in bench.moved)
     return Left(tuple(map(np.concatenate, left)), tuple(map(np.concatenate, measured)), windows)
+
+
+def spread_of(found: Refit, bench: Bench, records: Sequence[Record], left: Left, seed: int = 0) -> Left:
+    """How far runs over held-out samples part for numbers that are known no better: rms at each sample.
+
+    Args:
+        found: model.
+        bench: that it was fitted to.
+        records: whole.
+        left: what the model leaves of the samples, running on.
+        seed: of the numbers drawn, from the normal distribution of the fit.
+    """
+    size, turned = np.linalg.eigh(found.fit.covariance)
+    drawn = np.random.default_rng(seed).standard_normal((SPREAD, len(size)))
+    every = found.fit.theta + drawn * np.sqrt(np.maximum(size, 0.0)) @ turned.T
+
+    def run(theta: np.ndarray, number: int) -> np.ndarray:
+        drawn = found._replace(fit=found.fit._replace(theta=theta))
+        return _run_on(drawn, bench, records[number], number)[0].outputs[-len(left.left[number]) :]
+
+    spread = []
+    for number, rest in enumerate(left.left):
+        own = run(found.fit.theta, number)
+        parted = np.mean([(run(theta, number) - own) ** 2 for theta in every], axis=0)
+        spread.append(np.sqrt(parted) + 0 * rest)
+    return left._replace(left=tuple(spread))
 
 
 class _Held(NamedTuple):
@@ -260,6 +289,7 @@ def closure_of(
     noises: Sequence[Noise],
     names: Sequence[str],
     seed: int = 0,
+    spread: Left | None = None,
 ) -> Closure:
     """The closure and its interval, by drawing pieces of the held-out samples.
 
@@ -268,6 +298,7 @@ def closure_of(
         noises: of each record.
         names: of the sensors.
         seed: of the draws.
+        spread: how far runs part for numbers that are known no better.
 
     Source: H. Kunsch, Ann. Statist. 17 (1989), for drawing pieces rather than samples.
     """
@@ -299,7 +330,9 @@ def closure_of(
         fraction(b, a, n),
         (float(low), float(high)),
         fraction(r, a, n),
-        *(dict(zip(names, relative(x, every).tolist(), strict=True)) for x in (parts[2], floor)),
+        dict(zip(names, relative(parts[2], every).tolist(), strict=True)),
+        dict(zip(names, relative(floor, every).tolist(), strict=True)),
+        0.0 if spread is None else pooled(_by_piece(spread), every),
     )
 
 

@@ -61,6 +61,7 @@ PLAINER = 2  # laws of fewer numbers that are tried where the best one acts and 
 LINKED = 30  # most steps where each window leads to the next: the search goes along a curved valley
 MORE = 3  # further ones that are fitted thoroughly as those before them turn out worse than they seemed
 SECOND = 8  # further ones that are fitted thoroughly where none of those is worth anything
+SCREENED = 3  # likewise beside what was found, from where the screening begins
 SPRING = "missing_connection"
 
 
@@ -329,6 +330,13 @@ def _round(
         changes = changes_of(r, bench) if known is None else known.begin
         return _whole(bench, r.hypothesis, {"changes": changes}, effort)
 
+    def as_screened(i: int) -> Whole:
+        hypothesis, changes = next((h, x) for c, h, x in every if c is rough[i][0])
+        return _whole(bench, hypothesis, {"changes": changes}, effort)
+
+    first_one = without.hypothesis == Hypothesis()
+    laws = [c for c, *_ in every if c.kind not in ERRORS.values()][:SCREENED]
+    screened = [i for i, (c, _) in enumerate(rough) if any(c is x for x in laws)]
     close = [(top - value(r, bench)) / scale / effort.temperature < effort.behind for _, r in rough]
     most = effort.refined + len(done)
     nothing = value(alone(part, without), part) if rough and known is None else -math.inf
@@ -337,18 +345,21 @@ def _round(
     done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     near = CLOSE * scale * effort.temperature
     while due := still_due(rough, values := _values(rough, done, bench, part), done, near):
-        top = max((values[i] for i in done), default=-math.inf)
         if sum(math.isfinite(values[i]) for i in done) >= most + MORE:
-            values = [x if i in done else min(x, top - near) for i, x in enumerate(values)]
+            values = _below(values, done, near)
             break
         done |= dict(zip(due, side_by_side(thorough, due), strict=True))
     compared = _compared(rough, values, done, bench, without, effort)
-    first_one = known is None and without.hypothesis == Hypothesis()
-    if first_one and rough and not (compared.gain > WORTH or loud(compared)):
-        # a part of the records judges badly what is slow or slight, and all else hangs on a first effect
-        due = [i for i in range(len(rough)) if i not in done][:SECOND]
-        done |= dict(zip(due, side_by_side(thorough, due), strict=True))
-        compared = _compared(rough, _values(rough, done, bench, part), done, bench, without, effort)
+    # a part of the records judges badly what is slow or slight, and all else hangs on a first effect; beside one it may
+    # have led a law away that shows elsewhere, too, where all lines together would begin
+    further, fit = (range(len(rough)), thorough) if first_one else (screened, as_screened)
+    due = [i for i in further if i not in done][:SECOND]
+    if due and known is None and not (compared.gain > WORTH or (first_one and loud(compared))):
+        done |= dict(zip(due, side_by_side(fit, due), strict=True))
+        values = _values(rough, done, bench, part)
+        # what a rough fit led away tells nothing of what others lack to it
+        values = values if first_one else _below(values, done, near)
+        compared = _compared(rough, values, done, bench, without, effort)
     return sliding(nested(compared, effort.steps, say), say)
 
 
@@ -401,6 +412,12 @@ def _values(
     ratio = _ratio(bench, part) * math.exp(gain)
     every = (own.get(i, level - ratio * (top - value(r, bench))) for i, (_, r) in enumerate(rough))
     return [x if math.isfinite(x) else -math.inf for x in every]
+
+
+def _below(values: Sequence[float], done: Mapping[int, Whole], near: float) -> list[float]:
+    """The same, what is not fitted thoroughly no nearer to the best of what is than that."""
+    top = max((values[i] for i in done), default=-math.inf)
+    return [x if i in done else min(x, top - near) for i, x in enumerate(values)]
 
 
 def _compared(

@@ -35,7 +35,7 @@ from jaxsid.gap.look import (
     to_try,
     varied,
 )
-from jaxsid.gap.null import found_part
+from jaxsid.gap.null import SIGNIFICANT, found_part
 from jaxsid.gap.numbers_off import hint, numbers_off
 from jaxsid.gap.ranking import (
     WORTH,
@@ -44,6 +44,7 @@ from jaxsid.gap.ranking import (
     Whole,
     alike,
     clearly,
+    ends_of,
     key_of,
     loud,
     notable,
@@ -309,13 +310,19 @@ def _further(
 ) -> Found:
     """With one effect more, if any is worth it, and what is left then."""
     ranking = rank(at.bench, candidates, at.before, effort, say)
-    if not ranking.ranked or not worth(ranking, LEAST if at.selected else _least(at.look)):
+    if not ranking.ranked or not worth(ranking, 0.0 if at.selected else _least(at.look)):
+        return at.refused(ranking)
+    little = bool(at.selected) and not worth(ranking, LEAST)
+    if little and any(ends_of(x.place) == ends_of(ranking.ranked[0].place) for x in at.selected):
         return at.refused(ranking)
     ranking, found = _slid(at, ranking, at.taken(ranking), say)
     if not (found.holds and found.selected[-1].told):
         return at.refused(ranking)
     say("what is left")
     found = _left(found, model, seen)
+    # beside a law that is not quite the true one there is always a little more to explain, and never all of it
+    if little and found.look.null.p_value < SIGNIFICANT:
+        return at.refused(ranking)
     if found.look.clear:
         return found
     plain = plainer(ranking, at.before, effort, say)

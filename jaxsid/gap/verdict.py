@@ -27,6 +27,7 @@ LAPSE = 0.02  # share of cases of the fifth test set in which what explains all,
 # likewise where tests find more than noise in what it leaves, and that is over so much of what the linear model does
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
+UNSURE = 2.0  # deviations of a run over unseen samples, for what is not known of the numbers
 SPARED = 0.5  # of what tests found in the samples seen: an effect that leaves them less was of use there
 OTHER = (
     0.9  # likewise of laws that one of another shape surely adds to, 19 of 22, one of the others found since
@@ -108,12 +109,13 @@ def _unexplained(causes: Causes, found: Examination) -> float:
     structure = found.finding == "structure"
     # where tests find nothing in what was seen, numbers a little off show in a run over what was not
     bare = bool(causes.selected) and causes.places is None
-    more = structure and last.after > (CLEAR if bare else SURE) * last.noise_floor
+    floor = math.hypot(last.noise_floor, UNSURE * last.unsure) if bare else last.noise_floor
+    more = structure and last.after > (CLEAR if bare else SURE) * floor
     beyond = more or (found.finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     # real friction and hysteresis are richer than any law of theirs, which counts where it explains most
     rough = any(CATALOGUE[x.kind].rubs for x in causes.selected)
     # which, as long as they are little, tell nothing against a law that explains those
-    told = (last, causes.seen) if bare and not substantial(last.after, last.noise_floor) else (last,)
+    told = (last, causes.seen) if bare and not substantial(last.after, floor) else (last,)
     gone = max(c.against_recalibrated if beyond else c.fraction for c in told)
     enough = MORE if more and not rough else ENOUGH
     lapse = LAPSE
