@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gap_bench import bench, colored, known
 from gap_helpers import DT, SAMPLES, chain, drive, exact, record
+from scipy.stats import norm
 
 import jaxsid
 from jaxsid.gap import closure as module
@@ -276,11 +277,18 @@ def test_what_is_not_known_of_one_number_parts_runs_along_its_slope(of):
     alone[which, which] = step**2
     of_one = found._replace(fit=found.fit._replace(covariance=alone))
     spread = spread_of(of_one, of, given[1], left(0.0)).left[0]
-    size = np.sqrt(np.mean(np.random.default_rng(0).standard_normal((SPREAD, len(alone)))[:, -1] ** 2))
+    drawn = np.random.default_rng(0).standard_normal((SPREAD, len(alone)))[:, -1]
+    size = np.median(np.abs(drawn)) / norm.ppf(0.75)
     np.testing.assert_allclose(
         spread, size * step * np.abs(slope), rtol=0.02, atol=0.01 * step * np.nanstd(slope)
     )
     np.testing.assert_array_equal(np.isnan(spread), [[False, False, True]] * SAMPLES)
+    # a damper known so little that it may push makes some runs grow without bound, of which no number comes
+    far, wild = 1e4, np.zeros_like(alone)
+    wild[which, which] = far**2
+    assert not np.isfinite(left(-far).left[0][:, :2]).all()
+    widely = found._replace(fit=found.fit._replace(covariance=wild))
+    assert np.isfinite(spread_of(widely, of, given[1], left(0.0)).left[0][:, :2]).all()
     # and counts in the closure as all else does
     lefts = left(0.0), left(0.0), left(0.0)
     closed = closure_of(*lefts, [known(np.array([0.1, 0.1, np.nan]))], ["a", "b", "c"], spread=lefts[2])

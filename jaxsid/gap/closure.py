@@ -21,6 +21,7 @@ from jaxsid.records import Record
 PIECES = 40  # that what is left is cut into for the interval
 DRAWS = 2000  # of pieces
 SPREAD = 16  # draws of a model's numbers
+MIDDLE = 0.6745  # of what is normally distributed half lies within so many deviations
 ROUNDS = 8  # of the search for initial states
 CLEAR = 1.5  # a gap over the noise floor from which on more than noise is left
 SHOWN = 0.25  # power of a gap next to that of noise, from which on samples show it
@@ -157,7 +158,7 @@ def left_before(found: Refit, bench: Bench) -> Left:
 
 
 def spread_of(found: Refit, bench: Bench, records: Sequence[Record], left: Left, seed: int = 0) -> Left:
-    """How far runs over held-out samples part for numbers that are known no better: rms at each sample.
+    """How far runs over held-out samples part for numbers that are known no better: a deviation at each sample.
 
     Args:
         found: model.
@@ -177,8 +178,10 @@ def spread_of(found: Refit, bench: Bench, records: Sequence[Record], left: Left,
     spread = []
     for number, rest in enumerate(left.left):
         own = run(found.fit.theta, number)
-        parted = np.mean([(run(theta, number) - own) ** 2 for theta in every], axis=0)
-        spread.append(np.sqrt(parted) + 0 * rest)
+        parted = np.abs([run(theta, number) - own for theta in every])
+        # by the middle one, since a number drawn may make a run grow without bound; where most do nothing is known
+        middle = np.median(np.where(np.isfinite(parted), parted, np.inf), axis=0) / MIDDLE
+        spread.append(np.where(np.isfinite(middle), middle, 0.0) + 0 * rest)
     return left._replace(left=tuple(spread))
 
 
