@@ -327,7 +327,7 @@ def test_beside_an_effect_those_that_a_part_led_away_begin_as_they_were_screened
     # what is known of all others is less than of the best of them
     best = max(x for x in compared[-1] if x <= -1e5)
     assert max(x for x in compared[-1]) == best
-    # not where one is worth it, nor for a first effect
+    # not where one is worth it
     assert len(round_of(monkeypatch, explain.FURTHER, 0, ranking(0.0), BESIDE, led_away=(1, 2))[0]) == usual
 
 

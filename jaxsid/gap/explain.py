@@ -331,7 +331,8 @@ def _round(
         return _whole(bench, r.hypothesis, {"changes": changes}, effort)
 
     def as_screened(i: int) -> Whole:
-        hypothesis, changes = next((h, x) for c, h, x in every if c is rough[i][0])
+        c, hypothesis, changes = next(x for x in every if x[0] is rough[i][0])
+        say(f"{c.kind} at {label(c.place)}, as it was screened")
         return _whole(bench, hypothesis, {"changes": changes}, effort)
 
     first_one = without.hypothesis == Hypothesis()
