@@ -213,7 +213,7 @@ def test_other_samples_tell_little_against_a_law_that_explains_all_of_those_seen
     )
     assert [verdict_of(examination(), x).name for x in other] == ["unknown"] * 3
     # unless its numbers, known no better, would leave as much of them
-    spread = [far._replace(unsure=far.noise_floor * x) for x in (0.55, 0.05)]
+    spread = [far._replace(unsure=far.noise_floor * x) for x in (0.56, 0.05)]
     assert [verdict_of(examination(), found._replace(closures=(x,))).name for x in spread] == [
         "effect",
         "unknown",
@@ -222,6 +222,30 @@ def test_other_samples_tell_little_against_a_law_that_explains_all_of_those_seen
     seen, others = closure(0.0126, 0.0126, 0.01256, 0.0472), closure(0.03, 0.03, 0.01004, 0.0332)
     apart = causes(ranking(0.0, -500.0), closures=[others], seen=seen)
     assert verdict_of(examination(finding="parameters"), apart).name == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("kind", "unsure", "name"),
+    [
+        # an end stop in the place of a spring that hardens with the fifth power: nothing is left of the samples seen
+        ("end_stop", 0.0009, "unknown"),
+        # whose numbers, or whose noise alone, would leave as much of others
+        ("end_stop", 0.0028, "effect"),
+        # nobody asked how far those are known, or dry friction, never as simple as its law
+        ("end_stop", 0.0, "effect"),
+        ("coulomb_friction", 0.0009, "effect"),
+    ],
+)
+def test_a_law_that_leaves_more_of_other_samples_than_its_numbers_tell_is_another(kind, unsure, name):
+    seen, left = closure(0.01142, 0.01474, 0.01138), closure(0.01418, 0.02257, 0.01338)
+    made = ranking(0.0, -500.0, kinds=[(kind, B12), ("backlash", B23)])
+    found = causes(made, closures=[left._replace(unsure=unsure)], seen=seen)
+    assert verdict_of(examination(), found).name == name
+    louder = causes(made, closures=[left._replace(unsure=unsure, after=0.0137)], seen=seen)
+    assert verdict_of(examination(), louder).name == "effect"
+    # one that explains nearly all of it is right, though tests of the samples seen cannot tell its numbers so well
+    most = causes(made, closures=[left._replace(unsure=unsure, recalibrated=0.1)], seen=seen)
+    assert verdict_of(examination(), most).name == "effect"
 
 
 def test_what_hardly_shrinks_the_gap_explains_nothing_though_noise_took_up_the_rest(monkeypatch):

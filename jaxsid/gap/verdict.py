@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsid.gap.causes import Causes
-from jaxsid.gap.closure import CLEAR, fraction, substantial
+from jaxsid.gap.closure import CLEAR, Closure, fraction, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.look import slight
@@ -28,6 +28,7 @@ LAPSE = 0.02  # share of cases of the fifth test set in which what explains all,
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
 UNSURE = 2.0  # deviations of a run over unseen samples, for what is not known of the numbers
+LOUDER = 1.03  # noise of those, next to that of the samples seen, that tells nothing against a law
 SPARED = 0.5  # of what tests found in the samples seen: an effect that leaves them less was of use there
 OTHER = (
     0.9  # likewise of laws that one of another shape surely adds to, 19 of 22, one of the others found since
@@ -109,14 +110,18 @@ def _unexplained(causes: Causes, found: Examination) -> float:
     structure = found.finding == "structure"
     # where tests find nothing in what was seen, numbers a little off show in a run over what was not
     bare = bool(causes.selected) and causes.places is None
-    floor = math.hypot(last.noise_floor, UNSURE * last.unsure) if bare else last.noise_floor
-    more = structure and last.after > (CLEAR if bare else SURE) * floor
+    allowed = _allowed(last, bare)
+    more = structure and last.after > allowed
     beyond = more or (found.finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     # real friction and hysteresis are richer than any law of theirs, which counts where it explains most
     rough = any(CATALOGUE[x.kind].rubs for x in causes.selected)
+    gone = last.against_recalibrated if beyond else last.fraction
+    if last.unsure > 0 and more:
+        gone = fraction(last.recalibrated, last.after, allowed)
     # which, as long as they are little, tell nothing against a law that explains those
-    told = (last, causes.seen) if bare and not substantial(last.after, floor) else (last,)
-    gone = max(c.against_recalibrated if beyond else c.fraction for c in told)
+    little = not substantial(last.after, math.hypot(last.noise_floor, UNSURE * last.unsure))
+    if bare and little and (rough or not more):
+        gone = max(gone, causes.seen.against_recalibrated if beyond else causes.seen.fraction)
     enough = MORE if more and not rough else ENOUGH
     lapse = LAPSE
     if structure and not more and causes.places is not None and last.after > SHRUNK * last.recalibrated:
@@ -124,6 +129,18 @@ def _unexplained(causes: Causes, found: Examination) -> float:
         idle = causes.bounded and last.after > HARDLY * last.recalibrated
         lapse = USELESS if idle and causes.remaining.share > SPARED * found.null.share else REMAINDER
     return float(lapse + (1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
+
+
+def _allowed(last: Closure, bare: bool) -> float:
+    """What a law of the catalogue may leave of other samples: what noise does, and numbers as far off as they may be.
+
+    One that is not quite the true one leaves more, however well it fits the samples that it was fitted to.
+    """
+    if not bare:
+        return SURE * last.noise_floor
+    if last.unsure == 0:
+        return CLEAR * last.noise_floor
+    return math.hypot(LOUDER * last.noise_floor, UNSURE * last.unsure)
 
 
 def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, Explanation]]:
