@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 import jaxsid
 from jaxsid.gap import closure as module
+from jaxsid.gap.causes import noise_floor
 from jaxsid.gap.closure import (
     SPREAD,
     Left,
@@ -21,6 +22,7 @@ from jaxsid.gap.closure import (
 )
 from jaxsid.gap.free_run import LEAD, PIECE, free_run
 from jaxsid.gap.hypothesis import FIXED, parameter_rows
+from jaxsid.gap.noise import REFUTED, Noise
 from jaxsid.gap.refit import FINEST, UNRESOLVED, Hypothesis, refitted, shot_of
 from jaxsid.gap.windows import blocks_of, untold
 from jaxsid.mechanics.effects.catalogue import CATALOGUE
@@ -294,3 +296,21 @@ def test_what_is_not_known_of_one_number_parts_runs_along_its_slope(of):
     closed = closure_of(*lefts, [known(np.array([0.1, 0.1, np.nan]))], ["a", "b", "c"], spread=lefts[2])
     assert closed.unsure == pytest.approx(closed.after)
     assert "unsure" not in closed.as_dict()
+
+
+def test_noise_of_other_samples_is_no_louder_than_what_any_model_leaves_of_them():
+    """A law under which the motion grows without bound, and noise that was guessed from windows that forgive it."""
+    guess, told = (
+        Noise(np.array([0.35]), np.array([[1.0]]), degrees, "residual") for degrees in (0.0, 500.0)
+    )
+
+    def floor(*rms, of=guess, part=REFUTED):
+        own, *others = (Left((np.full((400, 1), x),), ()) for x in rms)
+        (found,) = noise_floor((of,), own, others, part)
+        return found
+
+    assert floor(31.0, 0.088, 0.02).rms() == pytest.approx(0.02)
+    # a sensor may by chance leave a little less than another model's noise
+    assert floor(0.34, 0.33, 0.30).rms() == pytest.approx(0.34)
+    assert floor(31.0, 0.34, 0.02, of=told).rms() == pytest.approx(0.02)
+    assert floor(31.0, 0.34, 0.02, of=told, part=0.0).rms() == pytest.approx(0.35)

@@ -196,7 +196,7 @@ def _shrunk(tried: _Tried, whole: Sequence[Record], ends: tuple[int, ...]) -> _S
     told = bench.noises if look.clear else tuple(map(less, found.noises, bench.noises))
     # windows of a few samples take up noise themselves
     refuted = REFUTED if motions is None else 0.0
-    floor = tuple(no_louder(n, x, refuted) for n, x in zip(told, steps[-1].left, strict=True))
+    floor = noise_floor(told, steps[-1], before, refuted)
     names = [s.name for s in bench.model.sensors]
     # where each window begins anew what the numbers lack is taken up by states
     spread = None if windowed or not look.clear else spread_of(tried.chosen, bench, whole, steps[-1])
@@ -206,6 +206,25 @@ def _shrunk(tried: _Tried, whole: Sequence[Record], ends: tuple[int, ...]) -> _S
     least = [no_louder(n, x, refuted) for n, x in zip(told, after.left, strict=True)]
     same = closure_of(first, straight, after, least, names)
     return _Shrunk(tuple(each), steps, same, alone, floor, before, motions is not None)
+
+
+def noise_floor(
+    told: Sequence[Noise], own: Left, others: Sequence[Left], refuted: float
+) -> tuple[Noise, ...]:
+    """The noise of each record in samples that were not seen: no more than a model leaves, nor far more than others do.
+
+    Under a law that is not the true one the motion may grow without bound there, but noise is in what any model leaves.
+
+    Args:
+        told: noise by the samples that were seen.
+        own: what the model leaves.
+        others: what others leave.
+        refuted: part of noise that is no guess, less than which none of it can be left.
+    """
+    found = tuple(no_louder(n, x, refuted) for n, x in zip(told, own.left, strict=True))
+    for other in others:
+        found = tuple(no_louder(n, x, refuted, REFUTED) for n, x in zip(found, other.left, strict=True))
+    return found
 
 
 def _doubted(found: Examination, look: Look, selected: Sequence[Explanation]) -> bool:

@@ -341,7 +341,9 @@ def quieter(guess: Noise, left: Noise, found: float = 1.0) -> Noise:
     )
 
 
-def no_louder(noise: Noise, left: Float[np.ndarray, "samples outputs"], refuted: float = REFUTED) -> Noise:
+def no_louder(
+    noise: Noise, left: Float[np.ndarray, "samples outputs"], refuted: float = REFUTED, guessed: float = 1.0
+) -> Noise:
     """Each sensor's noise, no more than a model leaves of other samples.
 
     What disturbs the input, say, may be louder in one part of a record than in another. Noise that is no guess stands
@@ -351,11 +353,12 @@ def no_louder(noise: Noise, left: Float[np.ndarray, "samples outputs"], refuted:
         noise: of a record.
         left: of samples that the model was not fitted to; NaN where nothing was measured.
         refuted: part of noise that is no guess, less than which none of it can be left; 0 where that tells nothing.
+        guessed: likewise of noise that is one.
     """
     counts, squares = np.isfinite(left).sum(axis=0), np.nansum(left**2, axis=0)
     least = np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.inf)
     rms = noise.rms()
-    less = least < (1.0 if noise.degrees <= 0 else refuted) * rms
+    less = least < (guessed if noise.degrees <= 0 else refuted) * rms
     level = np.where(less, noise.level * least / np.where(less, rms, 1.0), noise.level)
     return Noise(level, noise.taps, noise.degrees, noise.source)
 
