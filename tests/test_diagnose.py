@@ -14,6 +14,7 @@ from jaxsid.cli import app
 from jaxsid.files.results_json import plain
 from jaxsid.gap import diagnose as module
 from jaxsid.gap.explain import element_place
+from jaxsid.gap.places import Place
 from jaxsid.gap.verdict import LAPSE
 from jaxsid.mechanics.lumped import Input, Matrices, Sensor, lumped_model
 from jaxsid.physical.elements import Element, element_matrices
@@ -158,6 +159,11 @@ def test_the_summary_says_what_comes_near_an_unknown_law(cubic, monkeypatch):
         return cubic._replace(judgement=judgement).summary[0]
 
     assert said().endswith("Its place is most likely b1 - b2.")
+    # of several that are not told apart first that of the law which explains most, which is there
+    several = (Place("input", ("f",)), Place("between", ("b1", "b2")))
+    apart = cubic.examination._replace(locations=cubic.examination.locations._replace(likely=several))
+    unsure = cubic._replace(examination=apart, judgement=cubic.judgement._replace(name="unknown"))
+    assert unsure.summary[0].endswith("Its place is most likely b1 - b2; not told from it: input f.")
     assert said(law).endswith("What comes near it is cubic stiffness between b1 and b2.")
     assert "Together, cubic stiffness between b1 and b2 and cubic stiffness" in said(law, law)
     # as it does where the numbers are far off

@@ -217,7 +217,8 @@ def scored(rows: list[Scored]) -> dict[str, Any]:
     """
     single = [c for c in rows if c.truth == "effect" and len(c.label["effects"]) == 1 and c.counts]
     several = [c for c in single if not c.label["one_sensor"]]
-    usual = [c for c in several if c.label["noise"] <= 0.01]
+    asked = lambda chosen: [c for c in chosen if not c.label["one_sensor"] and c.label["noise"] <= 0.01]  # noqa: E731
+    usual = asked(single)
     double = [c for c in rows if len(c.label["effects"]) == 2 and c.counts]
     none = [c for c in rows if c.truth == "none"]
     unknown = [c for c in rows if c.truth == "unknown" and c.counts]
@@ -251,6 +252,10 @@ def scored(rows: list[Scored]) -> dict[str, Any]:
         "missed": share(single + double, lambda c: c.verdict == "none"),
         "both_found": share(double, both),
         "both_alone": share(double, both_alone),
+        # in the conditions of the first rows
+        "usual_unknown_at_place": share(asked(unknown), unknown_found),
+        "usual_false_unknown": share(asked(single + double), lambda c: c.verdict == "unknown"),
+        "usual_both_found": share(asked(double), both),
         "calibration": calibration(rows),
         "closure": closures(single + double),
         "deviations": within([p for c in single + double for p in pulls(c.label, c.found)]),
@@ -276,6 +281,13 @@ ROWS = (
     ("known effects called none", "missed", ""),
     ("two effects, both found", "both_found", "75 %"),
     ("two effects, both found and nothing else", "both_alone", ""),
+    (
+        "outside the catalogue: unknown, at its place; two sensors or more, at most 1 % noise",
+        "usual_unknown_at_place",
+        "",
+    ),
+    ("known effects called unknown, likewise", "usual_false_unknown", ""),
+    ("two effects, both found, likewise", "usual_both_found", ""),
 )
 
 

@@ -10,7 +10,7 @@ from jaxsid.gap.locate import located
 from jaxsid.gap.measure import Gap
 from jaxsid.gap.numbers import LEAST_CHANGE, at_the_least, off_numbers
 from jaxsid.gap.places import Place
-from jaxsid.gap.ranking import Explanation
+from jaxsid.gap.ranking import Explanation, ends_of
 from jaxsid.gap.verdict import Verdict
 from jaxsid.mechanics.lumped import LumpedModel
 
@@ -116,7 +116,7 @@ def summary(found: Found) -> tuple[str, str]:
                 f"is left with better ones.{_near(found.judgement.imitating)}",
                 shrinks,
             )
-        place = "" if likely is None else f" Its place is most likely {_place(likely.ranked[0].place)}."
+        place = "" if likely is None else _most_likely(likely.likely, causes)
         return (
             "The model lacks something that no kind of effect in the catalogue explains."
             f"{place}{_near(found.judgement.imitating)}",
@@ -129,6 +129,14 @@ def summary(found: Found) -> tuple[str, str]:
         others = ", ".join(named(x) for likely in found.judgement.likely for x in likely[1:])
         return f"{what[0].upper()}{what[1:]}. These records cannot tell it from {others}.", shrinks
     return f"{what[0].upper()}{what[1:]}.", shrinks
+
+
+def _most_likely(places: tuple[Place, ...], causes: Causes) -> str:
+    """A sentence of the places that are not told apart, first that of the law which comes nearest."""
+    nearest = [ends_of(x.place) for r in causes.rounds[:1] for x in r.ranked[:1]]
+    first, *others = sorted(places, key=lambda p: ends_of(p.as_dict()) not in nearest)
+    said = f" Its place is most likely {_place(first)}"
+    return f"{said}; not told from it: {', '.join(map(_place, others))}." if others else f"{said}."
 
 
 def _near(imitating: tuple[Explanation, ...]) -> str:
