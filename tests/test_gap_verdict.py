@@ -240,7 +240,11 @@ def test_a_law_that_leaves_more_of_other_samples_than_its_numbers_tell_is_anothe
     seen, left = closure(0.01142, 0.01474, 0.01138), closure(0.01418, 0.02257, 0.01338)
     made = ranking(0.0, -500.0, kinds=[(kind, B12), ("backlash", B23)])
     found = causes(made, closures=[left._replace(unsure=unsure)], seen=seen)
-    assert verdict_of(examination(), found).name == name
+    verdict = verdict_of(examination(), found)
+    assert (verdict.name, verdict.outrun) == (name, name == "unknown")
+    # what comes near is said, and why it is not the law
+    assert [x.kind for x in verdict.imitating] == [kind] * verdict.outrun
+    assert ["However near end stop" in x for x in about_doubt(found, verdict)] == [True] * verdict.outrun
     louder = causes(made, closures=[left._replace(unsure=unsure, after=0.0137)], seen=seen)
     assert verdict_of(examination(), louder).name == "effect"
     # one that explains nearly all of it is right, though tests of the samples seen cannot tell its numbers so well

@@ -45,6 +45,7 @@ class Verdict(NamedTuple):
         likely: for each effect that was found, the explanations that are not told apart, most probable first.
         imitating: effects of the catalogue that look like one that is not in it.
         paired: two laws at one place, where that is the most likely reason why none of the catalogue would be right.
+        outrun: whether those that look like it explain the samples that they were fitted to, but not the others.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Verdict(NamedTuple):
     likely: tuple[tuple[Explanation, ...], ...]
     imitating: tuple[Explanation, ...] = ()
     paired: tuple[Explanation, ...] = ()
+    outrun: bool = False
 
 
 def concluded(found: Examination, causes: Causes | None) -> tuple[Causes | None, Verdict]:
@@ -92,7 +94,9 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
-        return Verdict("unknown", probability, likely, imitating)
+        outrun = not imitating and causes.places is None and causes.seen.against_recalibrated > ENOUGH
+        near = causes.selected if outrun else imitating
+        return Verdict("unknown", probability, likely, near, outrun=outrun and bool(near))
     open_ones = any(len(x) > 1 for x in likely)
     return Verdict("ambiguous" if open_ones else "effect", probability, likely, paired=paired)
 

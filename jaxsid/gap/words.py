@@ -161,6 +161,12 @@ def about_doubt(causes: Causes | None, verdict: Verdict) -> list[str]:
             f"However near {said} may come: a force of another shape, of displacement and velocity there, explains "
             "more of what it leaves than chance ever does. The law is not in the catalogue, or another acts there, too."
         ]
+    if verdict.outrun:
+        said = " and ".join(map(named, verdict.imitating))
+        return [
+            f"However near {said} may come in the samples used: more is left of the others than noise and what is not "
+            "known of the numbers make up."
+        ]
     if causes is None or not causes.selected or verdict.name == "unknown" or unknown < DOUBTED:
         return []
     doubt = f"A probability of {unknown:.2f} is left for what the catalogue does not hold:"
