@@ -94,9 +94,11 @@ def verdict_of(found: Examination, causes: Causes | None) -> Verdict:
     probability = {"none": 0.0, "effect": 1 - unexplained, "unknown": unexplained}
     likely = tuple(_set(r.ranked) for r in causes.rounds[: len(causes.selected)])
     if unexplained > 0.5:
-        outrun = not imitating and causes.places is None and causes.seen.against_recalibrated > ENOUGH
-        near = causes.selected if outrun else imitating
-        return Verdict("unknown", probability, likely, near, outrun=outrun and bool(near))
+        asked = bool(causes.selected) and causes.places is None and causes.telling.unsure > 0
+        outrun = asked and not imitating and causes.seen.against_recalibrated > ENOUGH
+        return Verdict(
+            "unknown", probability, likely, causes.selected if outrun else imitating, outrun=outrun
+        )
     open_ones = any(len(x) > 1 for x in likely)
     return Verdict("ambiguous" if open_ones else "effect", probability, likely, paired=paired)
 
