@@ -170,6 +170,21 @@ def test_waves_are_so_close_that_none_between_two_is_missed():
         assert (rest**2).sum() < 0.25 * (left**2).sum()
 
 
+def test_attached_parts_are_also_tried_where_lines_stand_out():
+    at = Amplitudes(*(np.array([1.0, 3.0]) * (i + 1) for i in range(len(Amplitudes._fields))))
+    hertz = np.array([0.7, 7.33])
+    plain, grid = (grid_of("missing_mode", at, x) for x in (np.zeros(0), hertz))
+    count = plain.base.shape[1]
+    assert np.array_equal(grid.base[:, :count], plain.base)
+    more = grid.base[:, count:].reshape(2, len(hertz), RESONANCES[1], 3)
+    swings = np.sqrt(more[..., 1] / more[..., 0]) / (2 * np.pi)
+    assert swings == pytest.approx(np.broadcast_to(hertz[:, None], swings.shape))
+    assert np.array_equal(
+        more[..., 2], np.broadcast_to(plain.base[:, None, : RESONANCES[1], 2], swings.shape)
+    )
+    assert grid.probes.shape[1] == grid.base.shape[1]
+
+
 def screened(model, records, **more):
     noises = noise_of(model, records)
     settings = as_given(model, records, noises).settings
@@ -202,6 +217,19 @@ def test_truth_is_among_the_first_with_its_parameters(kind, at, place, parameter
         assert own.parameters[name] == pytest.approx(value, rel=0.2, abs=0.2 if name == "phase" else None)
     # in the quietest band's noise, which what the law leaves on the wrong trajectory is above
     assert own.left < 0.15 * linear.squares / linear.equations
+
+
+@pytest.mark.slow
+def test_a_sharp_resonance_is_found_at_its_body():
+    """Of 0.3 % damping, between two frequencies of the grid: a tenth as wide as their distance."""
+    frequency, mass = 7.63, 0.003
+    own = {"stiffness": mass * (2 * np.pi * frequency) ** 2, "damping": 6e-3 * mass * 2 * np.pi * frequency}
+    u = drive(4096)
+    records = (record(u, noisy(with_effect(u, "missing_mode", 1, {"mass": mass, **own}))),)
+    best = screened(chain(), records, kinds=("missing_mode",))[0]
+    assert best.place == {"body": "b2"}
+    found = np.sqrt(best.parameters["stiffness"] / best.parameters["mass"]) / (2 * np.pi)
+    assert found == pytest.approx(frequency, rel=5e-3)
 
 
 @pytest.mark.slow

@@ -204,7 +204,24 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
             value, is_ratio = neutral(p) if i in plan.linear else (p.prior.centre, True)
             ratio, own = value, not is_ratio
         base[..., i] = ratio * (1.0 if own else scale[i][:, None] ** power)
-    return _grid(kind, plan, base, scale, points[:, -1])
+    widths = points[:, -1]
+    if kind.vibrates is not None and plan.whole:
+        sharp = _swinging(kind, plan.shape[0], base[:, : len(points) // counts[0]], hertz)
+        base = np.concatenate([base, sharp], axis=1)
+        widths = np.resize(widths, base.shape[1])
+    return _grid(kind, plan, base, scale, widths)
+
+
+def _swinging(kind: Kind, i: int, base: np.ndarray, hertz: np.ndarray) -> np.ndarray:
+    """Points whose part swings at given frequencies, by its i-th parameter: a sharp resonance lies between others."""
+    swings = np.vectorize(lambda *x: kind.vibrates(*x))
+    doubled = base.copy()
+    doubled[..., i] *= 2
+    own, faster = (swings(*np.moveaxis(x, -1, 0)) for x in (base, doubled))
+    power = np.log2(faster / own)
+    at = np.repeat(base[:, None], len(hertz), axis=1)
+    at[..., i] *= (2 * np.pi * hertz[:, None] / own[:, None]) ** (1 / power[:, None])
+    return at.reshape(len(base), -1, base.shape[-1])
 
 
 def _number(kind: Kind, name: str) -> int:
