@@ -5,7 +5,7 @@ these follow in closed form once its shape parameters s are given. Kinds without
 their parameters together, or are scaled as they are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import product
 from statistics import NormalDist
@@ -206,15 +206,15 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
         base[..., i] = ratio * (1.0 if own else scale[i][:, None] ** power)
     widths = points[:, -1]
     if kind.vibrates is not None and plan.whole:
-        sharp = _swinging(kind, plan.shape[0], base[:, : len(points) // counts[0]], hertz)
+        sharp = _swinging(kind.vibrates, plan.shape[0], base[:, : len(points) // counts[0]], hertz)
         base = np.concatenate([base, sharp], axis=1)
         widths = np.resize(widths, base.shape[1])
     return _grid(kind, plan, base, scale, widths)
 
 
-def _swinging(kind: Kind, i: int, base: np.ndarray, hertz: np.ndarray) -> np.ndarray:
+def _swinging(vibrates: Callable[..., float], i: int, base: np.ndarray, hertz: np.ndarray) -> np.ndarray:
     """Points whose part swings at given frequencies, by its i-th parameter: a sharp resonance lies between others."""
-    swings = np.vectorize(lambda *x: kind.vibrates(*x))
+    swings = np.vectorize(vibrates)
     doubled = base.copy()
     doubled[..., i] *= 2
     own, faster = (swings(*np.moveaxis(x, -1, 0)) for x in (base, doubled))

@@ -38,6 +38,7 @@ from jaxsid.gap.look import (
 from jaxsid.gap.null import SIGNIFICANT, found_part
 from jaxsid.gap.numbers_off import hint, numbers_off
 from jaxsid.gap.ranking import (
+    ERRORS,
     WORTH,
     Explanation,
     Ranking,
@@ -65,6 +66,7 @@ from jaxsid.gap.refit import (
 )
 from jaxsid.gap.screen import Candidate, unseen
 from jaxsid.gap.sliding import sliding
+from jaxsid.gap.wider import wider
 from jaxsid.gap.windows import SHORTEST
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
@@ -446,6 +448,9 @@ def _numbers(
             least and not any(hint(at.bench, at.before, x, NUMBERS) > least / 2 for x in (*off, *lacking))
         ):
             return at
+        if (law := _wider(at, off, model, seen, say)) is not at:
+            at = law
+            continue
         # the number farthest off, what the model lacks, the others
         candidates = (*off[:1], *lacking, *off[1:])
         ranking = rank(at.bench, candidates, at.before, effort, say)
@@ -457,6 +462,30 @@ def _numbers(
     if begun and len(at.selected) > begun:
         say("what is left")
         at = _reconsidered(_left(at, model, seen), model, seen, say)
+    return at
+
+
+def _wider(
+    at: Found,
+    off: Sequence[Candidate],
+    model: LumpedModel,
+    seen: Sequence[Record],
+    say: Callable[[str], None],
+) -> Found:
+    """With a law in the place of one that it holds, if it alone explains more than a number off there beside that."""
+    assert at.before is not None
+    errors = [c for c in off if c.kind in ERRORS.values()]
+    for i, x in enumerate(at.selected):
+        here = [c for c in errors if ends_of(c.place) == ends_of(x.place)]
+        without = _without(at, x, model)[0] if here else None
+        law = without and wider(at.bench, at.before, x, at.rounds[i], without, NUMBERS.steps)
+        if not law or law.ranked[0].key == x.key:
+            continue
+        say(f"{law.ranked[0].kind} in place of {x.kind}")
+        gain = (law.ranked[0].evidence - at.before.fit.evidence) / law.scale / NUMBERS.temperature
+        if gain > max(TELLING, *(hint(at.bench, at.before, c, NUMBERS) for c in here)):
+            new = _in_place(at, i, law)
+            return _left(new, model, seen) if new.holds else at
     return at
 
 

@@ -125,6 +125,7 @@ class Kind(NamedTuple):
         restoring: whether it is a spring that is not straight: its force follows the displacement alone, or its past.
         timed: whether its force goes by the time, too.
         form_of: the kind that it is a form of, told apart by a parameter more; "" for one of its own.
+        holds: a kind of one number that it becomes where all its numbers of that unit are equal; "" for none.
     """
 
     name: str
@@ -147,6 +148,7 @@ class Kind(NamedTuple):
     restoring: bool = False
     timed: bool = False
     form_of: str = ""
+    holds: str = ""
 
     @property
     def smooth(self) -> bool:

@@ -36,4 +36,5 @@ EFFECT = Kind(
     source="B. Armstrong-Helouvry, P. Dupont and C. Canudas de Wit, Automatica 30 (1994).",
     slip=level,
     sensible=_sensible,
+    holds="coulomb_friction",
 )
