@@ -432,13 +432,31 @@ def _compared(
     """The round, in the noise that the best one leaves."""
     if not rough:
         return ranked([], without, bench, effort.temperature)
-    at = done.get(int(np.argmax(values)), Whole(bench, rough[0][1]))
+    best = int(np.argmax(values))
+    at = done.get(best, Whole(bench, rough[0][1]))
     without = refitted(at.bench, without.hypothesis, **start_from(without, bench))
+    if best in done:
+        at = _no_worse(at, without)
+        done, values = {**done, best: at}, [*values[:best], density(*at), *values[best + 1 :]]
     every = []
     for i, ((c, r), x) in enumerate(zip(rough, values, strict=True)):
         own = done.get(i, Whole(bench, r))
         every.append((c, own.refit, x - volume(at.bench), left_in(at.bench, own)))
     return ranked(every, without, at.bench, effort.temperature)
+
+
+def _no_worse(whole: Whole, without: Refit) -> Whole:
+    """A fit, begun again where that without its candidate ended if it leaves more than that: it went astray.
+
+    Args:
+        whole: the fit.
+        without: to the same bench.
+    """
+    bench, found = whole
+    if found.fit.squares <= without.fit.squares or not math.isfinite(without.fit.evidence):
+        return whole
+    again = refitted(bench, found.hypothesis, **start_from(without, bench), steps=LINKED, gain=FINE)
+    return Whole(bench, again) if value(again, bench) > value(found, bench) else whole
 
 
 def _ratio(whole: Bench, part: Bench) -> float:
