@@ -288,6 +288,7 @@ def test_what_acts_between_no_bodies_is_not_followed(monkeypatch):
 DRIFTED = {"amplitude": 2.0, "wavenumber": 400.0, "phase": 3.5}
 
 
+@pytest.mark.slow
 def test_a_wave_that_is_far_off_is_found_by_its_other_lengths(snaps):
     *_, close = snaps
     c = candidate("cogging_ripple", B12, **DRIFTED)

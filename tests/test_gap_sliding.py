@@ -29,6 +29,7 @@ def round_of(kind, parameters, start):
     return ranked([(candidate(LOOP, B12), best, best.fit.evidence, 1.0)], without, bench, TEMPERATURE)
 
 
+@pytest.mark.slow
 def test_a_loop_that_slides_is_friction_with_its_numbers():
     first = round_of("stribeck_friction", GIVING, LOOPING | {"stiffness": 2500.0})
     found = sliding(first, silent)

@@ -66,7 +66,7 @@ from jaxsid.gap.refit import (
 )
 from jaxsid.gap.screen import Candidate, unseen
 from jaxsid.gap.sliding import sliding
-from jaxsid.gap.wider import wider
+from jaxsid.gap.wider import holding, wider
 from jaxsid.gap.windows import SHORTEST
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.records import Record
@@ -476,7 +476,7 @@ def _wider(
     assert at.before is not None
     errors = [c for c in off if c.kind in ERRORS.values()]
     for i, x in enumerate(at.selected):
-        here = [c for c in errors if ends_of(c.place) == ends_of(x.place)]
+        here = [c for c in errors if holding(x.kind) and ends_of(c.place) == ends_of(x.place)]
         without = _without(at, x, model)[0] if here else None
         law = without and wider(at.bench, at.before, x, at.rounds[i], without, NUMBERS.steps)
         if not law or law.ranked[0].key == x.key:

@@ -22,6 +22,15 @@ STARTS = 6  # of each number that the plainer law lacks
 APART = 1.1  # of two numbers that are one there: a little, so that the others count
 
 
+def holding(kind: str) -> list[Kind]:
+    """Kinds of effects that hold one as a special case.
+
+    Args:
+        kind: its name.
+    """
+    return [k for k in CATALOGUE.values() if k.holds == kind]
+
+
 def wider(
     bench: Bench, found: Refit, x: Explanation, before: Ranking, without: Refit, steps: int
 ) -> Ranking | None:
@@ -37,7 +46,7 @@ def wider(
     """
     effects = found.hypothesis.effects
     row = next((i for i, e in enumerate(effects) if key_of(e.kind, dict(e.place)) == x.key), None)
-    kinds = [k for k in CATALOGUE.values() if k.holds == x.kind]
+    kinds = holding(x.kind)
     if row is None or not kinds:
         return None
     begin = {"changes": changes_of(found, bench), "states": states_without(found, row)}
