@@ -20,7 +20,7 @@ from gap_helpers import (
 
 import jaxsid
 from jaxsid.gap.dictionary import columns
-from jaxsid.gap.grids import RESONANCES, WIDTHS, grid_of, plan_of, quantiles
+from jaxsid.gap.grids import RESONANCES, WIDTHS, _speeds, grid_of, plan_of, quantiles
 from jaxsid.gap.noise import noise_of
 from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import as_given, beside, recalibrated
@@ -183,6 +183,12 @@ def test_attached_parts_are_also_tried_where_lines_stand_out():
         more[..., 2], np.broadcast_to(plain.base[:, None, : RESONANCES[1], 2], swings.shape)
     )
     assert grid.probes.shape[1] == grid.base.shape[1]
+
+
+def test_what_a_part_swings_by_may_come_in_any_order():
+    vibrates = CATALOGUE["missing_mode"].vibrates
+    assert _speeds(vibrates, (1, 2), np.array([1.0, 40.0, 0.3])) == 0
+    assert _speeds(lambda m, c, k: vibrates(m, k, c), (1, 2), np.array([1.0, 0.3, 40.0])) == 1
 
 
 def screened(model, records, **more):

@@ -30,6 +30,7 @@ from jaxsid.gap.ranking import (
     left_in,
     loud,
     numbers_of,
+    others_in,
     parsimonious,
     ranked,
     still_due,
@@ -235,9 +236,10 @@ def elsewhere(
     if top is None or density(*top[1]) <= best.evidence + volume(ranking.bench):
         return ranking
     at = top[1].bench
-    every = [(c, w.refit, density(*w) - volume(at), left_in(at, w)) for c, w in new.values()]
-    shift, louder = volume(ranking.bench) - volume(at), math.exp(gauge(at) - gauge(ranking.bench))
-    every += [(y, y.refit, y.evidence + shift, y.left * louder) for y in ranking.ranked if y.key not in new]
+    every = [
+        *((c, w.refit, density(*w) - volume(at), left_in(at, w)) for c, w in new.values()),
+        *others_in(at, ranking, new),
+    ]
     without = refitted(at, ranking.without.hypothesis, **start_from(ranking.without, bench))
     return ranked(every, without, at, effort.temperature)
 

@@ -5,6 +5,7 @@ these follow in closed form once its shape parameters s are given. Kinds without
 their parameters together, or are scaled as they are.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import product
@@ -206,10 +207,22 @@ def grid_of(name: str, at: Amplitudes, hertz: Float[np.ndarray, " f"]) -> Grid:
         base[..., i] = ratio * (1.0 if own else scale[i][:, None] ** power)
     widths = points[:, -1]
     if kind.vibrates is not None and plan.whole:
-        sharp = _swinging(kind.vibrates, plan.shape[0], base[:, : len(points) // counts[0]], hertz)
+        k = _speeds(kind.vibrates, plan.shape, base[0, 0])
+        rest = points[:, k] == points[0, k]  # all other numbers, once
+        sharp = _swinging(kind.vibrates, plan.shape[k], base[:, rest], hertz)
         base = np.concatenate([base, sharp], axis=1)
-        widths = np.resize(widths, base.shape[1])
+        widths = np.concatenate([widths, np.tile(widths[rest], len(hertz))])
     return _grid(kind, plan, base, scale, widths)
+
+
+def _speeds(vibrates: Callable[..., float], shape: tuple[int, ...], at: np.ndarray) -> int:
+    """Which of the shape parameters most changes how fast the part swings."""
+    once = math.log(vibrates(*at))
+    return int(
+        np.argmax(
+            [abs(math.log(vibrates(*np.where(np.arange(len(at)) == i, 2 * at, at))) - once) for i in shape]
+        )
+    )
 
 
 def _swinging(vibrates: Callable[..., float], i: int, base: np.ndarray, hertz: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """How explanations are compared: by the evidence of their fits, as densities of the records in any noise."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -387,6 +387,20 @@ def ranked(
         temperature,
         bench,
     )
+
+
+def others_in(
+    bench: Bench, of: Ranking, but: Collection[Key]
+) -> list[tuple[Explanation, Refit, float, float]]:
+    """What a round has beside some, in the noise of another bench, for `ranked`.
+
+    Args:
+        bench: tells the noise.
+        of: the round.
+        but: what is left out.
+    """
+    shift, louder = volume(of.bench) - volume(bench), math.exp(gauge(bench) - gauge(of.bench))
+    return [(y, y.refit, y.evidence + shift, y.left * louder) for y in of.ranked if y.key not in but]
 
 
 def worth(ranking: Ranking, least: float) -> bool:

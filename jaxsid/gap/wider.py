@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from jaxsid.gap.grids import quantiles
-from jaxsid.gap.ranking import Explanation, Ranking, Whole, gauge, key_of, left_in, ranked, value, volume
+from jaxsid.gap.ranking import Explanation, Ranking, Whole, key_of, left_in, others_in, ranked, value
 from jaxsid.gap.refit import Bench, Refit, changes_of, refitted, shot_of, states_without
 from jaxsid.gap.roughly import FINE
 from jaxsid.gap.screen import Candidate
@@ -64,8 +64,7 @@ def wider(
             at = Candidate(kind.name, x.place, {}, np.zeros(0), 0.0, math.nan, "", {})
             every.append((at, best, value(best, bench), left_in(bench, Whole(bench, best))))
     new = {key_of(c.kind, c.place) for c, *_ in every}
-    shift, louder = volume(before.bench) - volume(bench), math.exp(gauge(bench) - gauge(before.bench))
-    every += [(y, y.refit, y.evidence + shift, y.left * louder) for y in before.ranked if y.key not in new]
+    every += others_in(bench, before, new)
     return ranked(every, without, bench, before.temperature) if len(new) > 1 else None
 
 
