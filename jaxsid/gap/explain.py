@@ -236,10 +236,8 @@ def elsewhere(
     if top is None or density(*top[1]) <= best.evidence + volume(ranking.bench):
         return ranking
     at = top[1].bench
-    every = [
-        *((c, w.refit, density(*w) - volume(at), left_in(at, w)) for c, w in new.values()),
-        *others_in(at, ranking, new),
-    ]
+    every = [(c, w.refit, density(*w) - volume(at), left_in(at, w)) for c, w in new.values()]
+    every = [*every, *others_in(at, ranking, new)]
     without = refitted(at, ranking.without.hypothesis, **start_from(ranking.without, bench))
     return ranked(every, without, at, effort.temperature)
 
