@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PEERS := .venv-bench
 FIGURES := build/bench
 STAMP := $(VENV)/.installed
-CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --benchmark-disable --durations=12
+CHECKED := pytest --jaxtyping-packages=jaxsid,beartype.beartype -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable --durations=12
 
 .PHONY: setup demo lint test test-all bench bench-refine bench-effects bench-calibration blind docs notebooks clean
 

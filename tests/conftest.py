@@ -1,5 +1,6 @@
 """Shared settings and fixtures: double precision, the data path, a compilation cache."""
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,9 +28,18 @@ if not os.environ.get("CI"):
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+MOST_MAPPED = 20_000  # of the 65 530 pieces of memory that Linux lets a process map
+
+
+def _mapped() -> float:
+    """How many pieces of memory this process has mapped: each compiled program is a few; not told outside Linux."""
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else math.inf
+
+
 @pytest.fixture(autouse=True, scope="module")
 def release_programs() -> Iterator[None]:
-    """Drop the compiled programs of a file when it is done: thousands of them exhaust a process.
+    """Drop compiled programs when a file is done and many are there: thousands of them exhaust a process.
 
     The command switches its own cache on; what was set before comes back.
     """
@@ -37,7 +47,8 @@ def release_programs() -> Iterator[None]:
     yield
     keep_programs(None)
     jax.config.update("jax_compilation_cache_dir", folder)
-    jax.clear_caches()
+    if _mapped() > MOST_MAPPED:
+        jax.clear_caches()
 
 
 @pytest.fixture
