@@ -3,7 +3,7 @@
     .venv/bin/python benchmarks/blind/run.py OUT [--shard i/n] [--again]
 
 OUT/found/NNNN.json gets what diagnosis.json holds and the seconds that it took, or how it failed. A second run goes on
-where the first stopped; with --again cases that failed are tried once more.
+where the first stopped, inside a case too (OUT/begun/NNNN); with --again cases that failed are tried once more.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import jax
@@ -21,25 +22,55 @@ from generate import written
 
 import jaxsid
 from jaxsid.compilation import default_folder, keep_programs
+from jaxsid.gap.resume import resumable
 
 
-def diagnosed(folder: Path) -> dict[str, Any]:
+class Clock:
+    """Seconds that a case has taken, those of runs that were cut off included up to their last stage.
+
+    Attributes:
+        path: of a file that keeps them between runs.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._spent = json.loads(path.read_text()) if path.exists() else [0.0, 0.0]
+        self._began = self._now()
+        self._lock = Lock()  # stages run side by side
+
+    def read(self) -> dict[str, float]:
+        """On the wall and of the processor."""
+        each = (round(s + n - b, 2) for s, n, b in zip(self._spent, self._now(), self._began, strict=True))
+        return dict(zip(("seconds", "processor_seconds"), each, strict=True))
+
+    def keep(self, _stage: str) -> None:
+        """Write down what was spent."""
+        with self._lock:
+            written(self.path, json.dumps([*self.read().values()]))
+
+    @staticmethod
+    def _now() -> tuple[float, float]:
+        return time.perf_counter(), time.process_time()
+
+
+def diagnosed(folder: Path, begun: Path) -> dict[str, Any]:
     """What is found in a case, or how it failed.
 
     Args:
         folder: model.toml, run1.csv and run2.csv.
+        begun: a folder with what an earlier run left of it, if there is one; it goes at the end.
     """
-    began, processor = time.perf_counter(), time.process_time()
-    took = lambda: {  # noqa: E731
-        "seconds": round(time.perf_counter() - began, 2),
-        "processor_seconds": round(time.process_time() - processor, 2),
-    }
-    try:
-        model = jaxsid.read_model(folder / "model.toml")
-        records = [jaxsid.read_record(folder / f"run{i}.csv", model) for i in (1, 2)]
-        return {"diagnosis": jaxsid.diagnose(model, records).as_dict(), **took()}
-    except Exception as error:
-        return {"failure": repr(error), "traceback": traceback.format_exc(), **took()}
+    clock = Clock(begun / "seconds.json")
+    with resumable(begun, resume=True):
+        try:
+            model = jaxsid.read_model(folder / "model.toml")
+            records = [jaxsid.read_record(folder / f"run{i}.csv", model) for i in (1, 2)]
+            return {
+                "diagnosis": jaxsid.diagnose(model, records, progress=clock.keep).as_dict(),
+                **clock.read(),
+            }
+        except Exception as error:
+            return {"failure": repr(error), "traceback": traceback.format_exc(), **clock.read()}
 
 
 def main() -> None:
@@ -55,7 +86,7 @@ def main() -> None:
         path = asked.out / "found" / f"{folder.name}.json"
         if path.exists() and not (asked.again and "failure" in json.loads(path.read_text())):
             continue
-        found = diagnosed(folder)
+        found = diagnosed(folder, asked.out / "begun" / folder.name)
         written(path, json.dumps(found, indent=1, default=float) + "\n")
         said = found.get("failure") or found["diagnosis"].get("verdict")
         print(f"{folder.name} {found['seconds']:7.1f} s  {said}", flush=True)
