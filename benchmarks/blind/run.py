@@ -53,24 +53,20 @@ class Clock:
         return time.perf_counter(), time.process_time()
 
 
-def diagnosed(folder: Path, begun: Path) -> dict[str, Any]:
+def diagnosed(folder: Path, clock: Clock) -> dict[str, Any]:
     """What is found in a case, or how it failed.
 
     Args:
         folder: model.toml, run1.csv and run2.csv.
-        begun: a folder with what an earlier run left of it, if there is one; it goes at the end.
+        clock: of this case.
     """
-    clock = Clock(begun / "seconds.json")
-    with resumable(begun, resume=True):
-        try:
-            model = jaxsid.read_model(folder / "model.toml")
-            records = [jaxsid.read_record(folder / f"run{i}.csv", model) for i in (1, 2)]
-            return {
-                "diagnosis": jaxsid.diagnose(model, records, progress=clock.keep).as_dict(),
-                **clock.read(),
-            }
-        except Exception as error:
-            return {"failure": repr(error), "traceback": traceback.format_exc(), **clock.read()}
+    try:
+        model = jaxsid.read_model(folder / "model.toml")
+        records = [jaxsid.read_record(folder / f"run{i}.csv", model) for i in (1, 2)]
+        found = jaxsid.diagnose(model, records, progress=clock.keep)
+        return {"diagnosis": found.as_dict(), **clock.read()}
+    except Exception as error:
+        return {"failure": repr(error), "traceback": traceback.format_exc(), **clock.read()}
 
 
 def main() -> None:
@@ -86,8 +82,10 @@ def main() -> None:
         path = asked.out / "found" / f"{folder.name}.json"
         if path.exists() and not (asked.again and "failure" in json.loads(path.read_text())):
             continue
-        found = diagnosed(folder, asked.out / "begun" / folder.name)
-        written(path, json.dumps(found, indent=1, default=float) + "\n")
+        begun = asked.out / "begun" / folder.name
+        with resumable(begun, resume=True):
+            found = diagnosed(folder, Clock(begun / "seconds.json"))
+            written(path, json.dumps(found, indent=1, default=float) + "\n")
         said = found.get("failure") or found["diagnosis"].get("verdict")
         print(f"{folder.name} {found['seconds']:7.1f} s  {said}", flush=True)
 
