@@ -157,8 +157,8 @@ def test_a_law_that_is_there_leaves_nothing_to_another():
 @pytest.mark.parametrize(
     "law",
     [
-        lambda d, v: 3e4 * d**2 * v,
-        lambda d, v: 4.0 * max(v, 0.0),
+        pytest.param(lambda d, v: 3e4 * d**2 * v, marks=pytest.mark.slow),
+        pytest.param(lambda d, v: 4.0 * max(v, 0.0), marks=pytest.mark.slow),
         lambda d, v: 1e9 * d**5,
     ],
     ids=["displacement damping", "one-sided damping", "fifth order"],

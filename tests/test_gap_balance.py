@@ -116,7 +116,7 @@ def test_its_share_is_that_of_what_it_does_to_the_sensors():
         (axis(drag=0.3), 1),
         (axis((("b1", "displacement"), ("b2", "displacement"))), 1),
         (axis(MIXED), 1),
-        (axis((("b2", "displacement"), *SPEEDS)), 2),
+        pytest.param(axis((("b2", "displacement"), *SPEEDS)), 2, marks=pytest.mark.slow),
         (axis((("b1", "velocity"),)), 0),
     ],
     ids=["speeds", "dragged", "displacements", "acceleration", "three", "one"],

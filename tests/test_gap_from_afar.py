@@ -28,6 +28,7 @@ def bench():
     return bench_of(chain(), [measured], found.noises, found.fit)
 
 
+@pytest.mark.slow
 def test_a_loop_screened_as_yielding_too_early_is_found(bench):
     c = candidate("hysteresis", B12, **SCREENED)
     ((_, found),) = roughly(

@@ -109,6 +109,7 @@ def rubbed():
     return SimpleNamespace(bench=bench, best=refitted(bench, Hypothesis((stribeck,)), steps=STEPS))
 
 
+@pytest.mark.slow
 def test_coulombs_law_gets_out_of_a_wrong_valley(rubbed):
     bench, best = rubbed.bench, rubbed.best
     wrong = Effect("coulomb_friction", tuple(FRICTION.items()), {"force": jnp.asarray(0.3)})

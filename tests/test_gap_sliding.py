@@ -46,6 +46,7 @@ def test_a_loop_that_slides_is_friction_with_its_numbers():
     assert set(new.effects[0].parameters) == set(GIVING)
 
 
+@pytest.mark.slow
 def test_a_loop_stays_one_though_it_slides():
     first = round_of("hysteresis", LOOPING, LOOPING | {"stiffness": 700.0})
     assert _begun(first.bench, first.ranked[0].refit.hypothesis.effects[0])

@@ -64,7 +64,8 @@ def white(seed=0, samples=1024, dt=0.02, level=0.01, inputs=3):
     return noisy(Record(u[:, :inputs], respond(CHAIN, dt, u), dt), level, rng)
 
 
-@pytest.mark.parametrize("dt", [pytest.param(1e-3, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [1e-3, 0.02])
 def test_white_excitation_with_noise(dt):
     record = white(samples=4096, inputs=1, dt=dt)
     ir = Direct()([record])

@@ -12,7 +12,9 @@ from jaxsid.impulse.dwt import depth, dwt, idwt, levels_of
 
 @pytest.mark.filterwarnings("ignore:Level value")
 @pytest.mark.parametrize("wavelet", ["haar", "db4", "db20", "sym5", "coif3"])
-@pytest.mark.parametrize(("length", "level"), [(16, 1), (64, None), (96, 5)])
+@pytest.mark.parametrize(
+    ("length", "level"), [(16, 1), pytest.param(64, None, marks=pytest.mark.slow), (96, 5)]
+)
 def test_agrees_with_pywavelets(wavelet, length, level):
     x = np.random.default_rng(0).standard_normal((length, 2))
     ours = dwt(jnp.asarray(x), wavelet=wavelet, level=level)

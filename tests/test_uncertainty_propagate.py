@@ -92,7 +92,10 @@ def test_era_dc_too():
     [
         WINDOW,
         pytest.param({"order": 6, "rows": 30, "cols": 25, "stride": 2}, marks=pytest.mark.slow),
-        {"order": 6, "row_steps": (0, 1, 3, 4, 7, 20, 33), "column_steps": tuple(range(50))},
+        pytest.param(
+            {"order": 6, "row_steps": (0, 1, 3, 4, 7, 20, 33), "column_steps": tuple(range(50))},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"order": 6, "row_steps": tuple(range(40)), "column_steps": (0, 2, 5, 9, 30)},
             marks=pytest.mark.slow,
