@@ -67,6 +67,7 @@ def test_probabilities_are_those_of_the_candidates(written):
     assert {key: first[key] for key in LAW} == LAW
     assert first["probability"] == pytest.approx(1 - LAPSE, abs=5e-3)
     assert first["confusable_with"] == []
+    assert first["parameters"] == written["selected"][0]["parameters"]
     assert len(others) >= 5
     assert sum(x["probability"] for x in written["effects"]) <= 1 + 1e-9
     assert [x["probability"] for x in others] == sorted((x["probability"] for x in others), reverse=True)

@@ -152,11 +152,13 @@ class Diagnosis(NamedTuple):
     def effects(self) -> list[dict[str, Any]]:
         """Candidates of the rounds in which an effect was found, most probable first.
 
-        Each with the number of its round, and the rms in noise that its fit leaves.
+        Each with the number of its round, and the rms in noise that its fit leaves. Parameters of those selected are
+        those of the last fit, as everywhere else; of the others, those that they were compared with.
         """
         if self.causes is None:
             return []
         count = max(len(self.causes.selected), 1)
+        selected = {x.key for x in self.causes.selected}
         best: dict[Key, tuple[Explanation, Ranking, int]] = {}
         for number, ranking in enumerate(self.causes.rounds[:count], start=1):
             for x in ranking.ranked:
@@ -167,7 +169,7 @@ class Diagnosis(NamedTuple):
             {
                 **as_pair(x),
                 "probability": self.probability(x),
-                "parameters": self._parameters(x, x.refit),
+                "parameters": self._parameters(x, self.causes.chosen if x.key in selected else x.refit),
                 "confusable_with": [
                     as_pair(y) for y in ranking.ranked if y.key != x.key and alike(x, y, ranking)
                 ],
