@@ -148,7 +148,8 @@ def _ranking(found: Diagnosis, own: list[dict[str, Any]], number: int, rounds: i
     )
     note = (
         "By the evidence of a fit, that is how well the best parameters explain the samples and how many others would "
-        "have done as well. Left: rms of what a fit leaves of the samples it saw, noise = 1."
+        "have done as well. Left: rms of what a fit leaves of the samples it saw, noise = 1. Parameters of what was "
+        "selected are those of the last fit, with all that was found."
     )
     if any(n.degrees == 0 for n in found.examination.noises):
         note += " That noise was guessed before any effect was known: a fit may leave less."
