@@ -1,8 +1,10 @@
 """Workers: real processes, one of which is killed, give the bytes of a run in one process."""
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -90,9 +92,13 @@ def at(count, act):
     return progress
 
 
-def test_two_workers_give_the_same_bytes(tmp_path, expected):
-    with local_workers(2) as execute:
-        run(PLAN, tmp_path, execute=execute)
+def test_two_workers_give_the_same_bytes_beside_another_cluster(tmp_path, expected):
+    with socket.socket() as other:
+        with contextlib.suppress(OSError):  # whoever holds it already is another as well
+            other.bind(("0.0.0.0", 8787))
+            other.listen()
+        with local_workers(2) as execute:
+            run(PLAN, tmp_path, execute=execute)
     assert results(tmp_path) == expected
 
 

@@ -88,7 +88,8 @@ def local_workers(count: int) -> Iterator[Execute]:
             n_workers=count,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            # Without a port named, its web server asks for 8787, which another study may hold.
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             memory_limit=0,
             silence_logs=logging.CRITICAL,
         )
