@@ -72,7 +72,13 @@ def fitted(model, force, seed=0, offset=0.0):
 
 @pytest.mark.parametrize(
     "model",
-    [axis(), axis(drag=0.3), axis(MIXED), axis(MIXED, 0.3), axis(MIXED, hold="first")],
+    [
+        axis(),
+        pytest.param(axis(drag=0.3), marks=pytest.mark.slow),
+        axis(MIXED),
+        pytest.param(axis(MIXED, 0.3), marks=pytest.mark.slow),
+        axis(MIXED, hold="first"),
+    ],
     ids=["free", "dragged", "mixed", "both", "ramps"],
 )
 def test_noise_alone_gives_what_chance_does(model):

@@ -59,6 +59,7 @@ def test_what_effects_do_is_taken_out(effects, late_by, followed, monkeypatch):
     assert (left.inputs, left.outputs) == (record(u, y).inputs, record(u, y).outputs)
 
 
+@pytest.mark.slow
 def test_what_a_late_input_was_before_the_record_is_no_finding():
     """An accelerometer beside the drive reads it at once: at first what nobody recorded."""
     begin, late_by = 200, 2.4 * DT

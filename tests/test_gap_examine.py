@@ -34,6 +34,7 @@ def test_wrong_stiffness_is_an_error_of_parameters():
     np.testing.assert_allclose(found.refit.stiffness, chain().stiffness, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_cubic_spring_is_a_matter_of_structure():
     u = drive()
     y = noisy(with_effect(u, "cubic_stiffness", JOINT, {"coefficient": 1e6}))

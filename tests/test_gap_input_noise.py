@@ -110,7 +110,8 @@ def test_a_measured_drive_is_agreement():
     assert found.null.input_noise == pytest.approx([0.01], rel=0.15)
 
 
-@pytest.mark.parametrize("one", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("one", [False, True])
 def test_its_resonances_are_no_lone_frequency(one):
     """Of springs that are damped little: where noise of the input is not allowed for they are."""
     model = replace(chain(), damping=0.3 * chain().damping)
@@ -165,7 +166,8 @@ def test_one_sensor_tells_it_by_the_peaks_of_the_model():
     assert np.median([x.seen for x in found]) > CERTAIN
 
 
-@pytest.mark.parametrize("pole", [pytest.param(0.0, marks=pytest.mark.slow), 0.9])
+@pytest.mark.slow
+@pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_one_sensor_tells_nothing_where_there_is_none(pole):
     """Its own noise, white or not, has no such peaks."""
     seen = []
@@ -191,6 +193,7 @@ def alone(r):
     return Record(r.u, np.asarray(r.y)[:, :1], DT, inputs=r.inputs, outputs=("s0",), name="alone")
 
 
+@pytest.mark.slow
 def test_a_record_of_one_sensor_beside_another_of_all_changes_nothing():
     found = examine(chain(), [measured(0.01, 1), alone(measured(0.01, 2))])
     assert found.finding == "agreement"

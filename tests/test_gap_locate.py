@@ -90,7 +90,8 @@ def test_place_is_found_with_one_sensor():
     assert any("One sensor" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("part", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("part", [0.2, 0.5])
 def test_an_input_late_by_part_of_a_sample_is_no_late_accelerometer(part):
     """A held input is read a whole step late by an accelerometer where it acts, however little it is late."""
     kinds = [(0, "acceleration")]
@@ -144,6 +145,7 @@ def test_force_is_that_of_the_law():
     assert 0 < found.deviation < 0.3 * expected.std()
 
 
+@pytest.mark.slow
 def test_error_of_a_sensor_of_an_unstable_model_is_followed():
     model = lumped_model(
         ["m"],

@@ -84,6 +84,7 @@ def test_a_tone_that_noise_took_for_its_colour_is_found_but_not_a_mode_that_ring
     assert p < 1e-20 if found else p > 1e-6
 
 
+@pytest.mark.slow
 def test_several_records_of_white_noise_hold_none():
     noise = known(np.ones(3))
     noise.taps[:, 1:] = 0.0

@@ -67,7 +67,7 @@ SMALL = [
     ("actuator_lag", "drive", {"time_constant": 0.004}),
     ("actuator_saturation", "drive", {"limit": 15.0}),
 ]
-QUICK = ("cubic_stiffness", "sensor_delay", "missing_mode")
+QUICK = ("cubic_stiffness", "sensor_delay")
 SENSED = (("b1", "acceleration"), ("b2", "displacement"), ("b3", "velocity"))
 
 

@@ -1,6 +1,7 @@
 """Steps of a simulation in fits: short enough for a law's kinks."""
 
 import numpy as np
+import pytest
 from gap_bench import bench
 from gap_helpers import JOINT, drive
 from gap_helpers import with_effect as truth
@@ -39,6 +40,7 @@ def test_steps_are_shorter_where_a_law_has_kinks():
     assert resolved(of, diverged) is of
 
 
+@pytest.mark.slow
 def test_steps_are_shorter_where_a_number_lies_off_that_no_sample_shows():
     """Many samples together tell more than each: a number is a tenth of its deviation off, and that is foreseen."""
     y = truth(drive(), "bilinear_stiffness", JOINT, {"stiffness": 500.0})

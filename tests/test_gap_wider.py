@@ -55,6 +55,7 @@ def rubbed():
     )
 
 
+@pytest.mark.slow
 def test_friction_that_falls_with_speed_is_found_from_where_coulombs_ended(rubbed):
     x = rubbed.round.ranked[0]
     best, *others = wider(rubbed.bench, rubbed.found, x, rubbed.round, rubbed.without, STEPS).ranked

@@ -11,7 +11,9 @@ from jaxsid.impulse.dwt import depth, dwt, idwt, levels_of
 
 
 @pytest.mark.filterwarnings("ignore:Level value")
-@pytest.mark.parametrize("wavelet", ["haar", "db4", "db20", "sym5", "coif3"])
+@pytest.mark.parametrize(
+    "wavelet", ["haar", "db4", "db20", *(pytest.param(x, marks=pytest.mark.slow) for x in ("sym5", "coif3"))]
+)
 @pytest.mark.parametrize(
     ("length", "level"), [(16, 1), pytest.param(64, None, marks=pytest.mark.slow), (96, 5)]
 )

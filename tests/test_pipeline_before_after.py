@@ -84,6 +84,7 @@ def test_without_refinement_cbsi_has_the_last_word(refined, unrefined):
     assert not any("refined" in w for w in refined.warnings)
 
 
+@pytest.mark.slow
 def test_without_refinement_missing_sensors_leave_no_matrices(model, record):
     seen = recorded(model, record.u, np.asarray(record.y)[:, :2], outputs=["s1", "s2"])
     found = identify(model, seen, refine=False)

@@ -269,6 +269,7 @@ def test_inputs_of_different_holds():
     check(found, system, Limits(1e-6, 1e-5, 1e-5, 1e-4))
 
 
+@pytest.mark.slow
 def test_fewer_sensors_than_bodies_still_give_modes(model, noisy):
     seen = recorded(model, noisy.u, noisy.y[:, :2], outputs=["s1", "s2"])
     found = identify(model, seen, structure="free")

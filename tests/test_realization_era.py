@@ -35,7 +35,12 @@ def assert_exact(name, samples, **window):
 
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize(
-    "window", [{"rows": 1000, "cols": 1000}, {"rows": 300, "cols": 300, "stride": 6}, {}]
+    "window",
+    [
+        {"rows": 1000, "cols": 1000},
+        pytest.param({"rows": 300, "cols": 300, "stride": 6}, marks=pytest.mark.slow),
+        {},
+    ],
 )
 def test_exact_recovery(name, window):
     assert_exact(name, 4096, **window)
@@ -155,7 +160,9 @@ def test_laguerre_shift():
     np.testing.assert_allclose(md.indicators.emac, 1, atol=1e-6)
 
 
-@pytest.mark.parametrize(("method", "level"), [("fast", 0.0), ("fast", 0.02), ("svd", 0.02)])
+@pytest.mark.parametrize(
+    ("method", "level"), [("fast", 0.0), ("fast", 0.02), pytest.param("svd", 0.02, marks=pytest.mark.slow)]
+)
 def test_derivative_is_the_difference_quotient(method, level):
     ir, _ = noisy(samples=160, dt=0.05, level=level)
     direction = jnp.asarray(np.random.default_rng(1).standard_normal(ir.h.shape))

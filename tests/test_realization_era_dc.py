@@ -29,7 +29,12 @@ def assert_exact(name, order, samples=4096, **window):
         ("one", 2, {"rows": 500, "cols": 500, "lags": 5, "first_lag": 500, "lag_step": 50}),
         ("chain", 6, {"rows": 5, "cols": 3000, "lags": 100}),
         ("chain_one_input", 6, {"rows": 5, "cols": 3000, "lags": 100, "first_lag": 5}),
-        ("chain", 6, {"rows": 5, "cols": 2000, "lags": 20, "lag_step": 40, "first_lag": 5}),
+        pytest.param(
+            "chain",
+            6,
+            {"rows": 5, "cols": 2000, "lags": 20, "lag_step": 40, "first_lag": 5},
+            marks=pytest.mark.slow,
+        ),
         ("chain", 6, {"rows": 50, "cols": 200, "lags": 7, "lag_step": 13, "first_lag": 1, "stride": 11}),
         ("overdamped", 2, {"rows": 30, "cols": 40, "lags": 10, "lag_step": 20, "first_lag": 3, "stride": 40}),
     ],

@@ -74,7 +74,7 @@ def test_era_from_the_exact_response(name):
     assert_exact(rz, case, poles=1e-10, physical=1e-8)
 
 
-@pytest.mark.parametrize("first_lag", [0, 5, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("first_lag", [0, *(pytest.param(x, marks=pytest.mark.slow) for x in (5, 200))])
 @pytest.mark.parametrize("name", CASES)
 def test_era_dc_from_the_exact_response(name, first_lag):
     case = CASES[name]
@@ -107,7 +107,7 @@ def test_era_dc_by_full_decomposition(name):
 
 
 @pytest.mark.parametrize("name", ["1 DOF", pytest.param("3 DOF, one input", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("algorithm", ["era", "era_dc"])
+@pytest.mark.parametrize("algorithm", [pytest.param("era", marks=pytest.mark.slow), "era_dc"])
 def test_a_batch_gives_the_same_numbers(name, algorithm):
     """Forces in other units scale M, D and K alike and leave the poles."""
     case = CASES[name]

@@ -63,6 +63,7 @@ def monte_carlo(realize, count, size=0.01):
     return scatter(drawn), IndependentNoise(jnp.full(ir.h.shape, size**2))
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_monte_carlo():
     """Deviations over 1600 samples are known to 1.8 %."""
     realize = lambda ir: jaxsid.era(ir, **WINDOW)  # noqa: E731
