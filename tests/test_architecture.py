@@ -20,6 +20,7 @@ LAYERS = (
     "parallel",
     "records",
     "checks",
+    "digits",
     "least_squares",
     "mechanics",
     "examples",

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from jaxsid import Effect, InputError, Record, diagnose, read_model, write_model
 from jaxsid.cli import app
+from jaxsid.digits import with_std
 from jaxsid.files.results_json import plain
 from jaxsid.gap import diagnose as module
 from jaxsid.gap.explain import element_place
@@ -71,6 +72,11 @@ def test_probabilities_are_those_of_the_candidates(written):
     assert len(others) >= 5
     assert sum(x["probability"] for x in written["effects"]) <= 1 + 1e-9
     assert [x["probability"] for x in others] == sorted((x["probability"] for x in others), reverse=True)
+
+
+def test_the_finding_says_numbers_as_the_tables_do(cubic, written):
+    told = written["selected"][0]["parameters"]["coefficient"]
+    assert f"coefficient {with_std(told['value'], told['std'])} " in cubic.summary[0]
 
 
 def test_remarks_on_places_are_for_what_no_law_explains(cubic):

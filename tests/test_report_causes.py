@@ -9,6 +9,7 @@ import pytest
 from gap_helpers import DT, JOINT, SAMPLES, chain, drive, noisy, record, with_effect
 
 from jaxsid import Effect, diagnose
+from jaxsid.digits import share_of
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.gap.noise import Noise
 from jaxsid.gap.places import Place
@@ -17,7 +18,6 @@ from jaxsid.report.causes_page import closure_cards, closure_section, numbers_se
 from jaxsid.report.diagnosis_page import diagnosis_page
 from jaxsid.report.diagnosis_summary import print_diagnosis
 from jaxsid.report.law import law_along
-from jaxsid.report.numbers import share_of
 from jaxsid.report.plots.causes import (
     before_after_figure,
     density,

@@ -10,6 +10,7 @@ import pytest
 from report_fixture import WARNING, identification, without_matrices
 
 from jaxsid.checks import InputError
+from jaxsid.digits import with_std
 from jaxsid.mechanics.lumped import Input, Sensor, lumped_model
 from jaxsid.records import ImpulseResponse, Record
 from jaxsid.report.frame import (
@@ -29,7 +30,6 @@ from jaxsid.report.frame import (
 from jaxsid.report.html import check_installed, write_report
 from jaxsid.report.identification_page import report_page
 from jaxsid.report.modes import modes_of
-from jaxsid.report.numbers import with_std
 from jaxsid.report.plots import pole_figure
 
 VOID = {"meta", "br", "img", "link", "input", "hr"}

@@ -10,7 +10,7 @@ from study_helpers import rechunked, run, study
 from test_report_page import Reader
 
 from jaxsid.checks import InputError
-from jaxsid.report.numbers import percent
+from jaxsid.digits import percent
 from jaxsid.report.study_figures import quantile_figure, spread_figure
 from jaxsid.report.study_html import write_study_report
 from jaxsid.report.study_layout import Layout, layout, levels, panels

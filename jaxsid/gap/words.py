@@ -2,6 +2,7 @@
 
 from typing import Any, Protocol, runtime_checkable
 
+from jaxsid.digits import with_std
 from jaxsid.gap.causes import Causes
 from jaxsid.gap.closure import substantial
 from jaxsid.gap.examine import Examination
@@ -265,7 +266,7 @@ def _sentence(found: Found, number: int) -> str:
 def _value(name: str, p: dict[str, Any]) -> str:
     value = p["value"] if not isinstance(p["value"], list) else p["value"][0]
     unit = f" {p['unit']}" if p["unit"] else ""
-    return f"{kind_words(name)} {value:.4g} ± {p['std']:.2g}{unit}"
+    return f"{kind_words(name)} {with_std(value, p['std'])}{unit}"
 
 
 def remaining(found: Found) -> str:

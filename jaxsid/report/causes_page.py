@@ -4,15 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsid.gap.closure import Closure, Left
-from jaxsid.gap.diagnose import Diagnosis
-from jaxsid.gap.explain import elements_by_key
-from jaxsid.gap.ranking import key_of
-from jaxsid.gap.words import kind_words, named, place_words, windows_words
-from jaxsid.mechanics.effects.catalogue import law_of
-from jaxsid.physical.elements import element_matrices
-from jaxsid.report.frame import Block, Card, Cell, Gallery, Picture, Section, Table, Text, picture
-from jaxsid.report.numbers import (
+from jaxsid.digits import (
     MISSING,
     chance,
     change,
@@ -22,6 +14,14 @@ from jaxsid.report.numbers import (
     significant,
     with_std,
 )
+from jaxsid.gap.closure import Closure, Left
+from jaxsid.gap.diagnose import Diagnosis
+from jaxsid.gap.explain import elements_by_key
+from jaxsid.gap.ranking import key_of
+from jaxsid.gap.words import kind_words, named, place_words, windows_words
+from jaxsid.mechanics.effects.catalogue import law_of
+from jaxsid.physical.elements import element_matrices
+from jaxsid.report.frame import Block, Card, Cell, Gallery, Picture, Section, Table, Text, picture
 from jaxsid.report.plots.causes import before_after_figure, chosen_name, held_out_pairs, spectra_figure
 
 RANKED, TESTS, FIGURES = 6, 4, 3

@@ -2,6 +2,19 @@
 
 import numpy as np
 
+from jaxsid.digits import (
+    MISSING,
+    TIMES,
+    chance,
+    change,
+    minus,
+    misfit,
+    percent,
+    plural,
+    share_of,
+    significant,
+    with_std,
+)
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.examine import NEGLIGIBLE
 from jaxsid.gap.locate import Location
@@ -30,19 +43,6 @@ from jaxsid.report.frame import (
     Text,
     page,
     picture,
-)
-from jaxsid.report.numbers import (
-    MISSING,
-    TIMES,
-    chance,
-    change,
-    minus,
-    misfit,
-    percent,
-    plural,
-    share_of,
-    significant,
-    with_std,
 )
 from jaxsid.report.plots.gap import (
     amplitude_figure,

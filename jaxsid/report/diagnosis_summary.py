@@ -5,12 +5,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 
+from jaxsid.digits import change, misfit, percent, share_of, significant, with_std
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.locate import Locations
 from jaxsid.gap.ranking import key_of
 from jaxsid.gap.words import APART, kind_words, place_words
 from jaxsid.report.causes_page import parameters_said
-from jaxsid.report.numbers import change, misfit, percent, share_of, significant, with_std
 from jaxsid.report.plots.places import label_of
 from jaxsid.report.summary import table
 

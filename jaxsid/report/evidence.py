@@ -5,12 +5,12 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
+from jaxsid.digits import percent, significant
 from jaxsid.identification import Identification
 from jaxsid.records import CbsiDiagnostics, Record
 from jaxsid.report.findings import TABLED
 from jaxsid.report.frame import Cell, Gallery, Link, Links, Picture, Section, Table, Text, picture
 from jaxsid.report.modes import modes_of
-from jaxsid.report.numbers import percent, significant
 from jaxsid.report.plots import (
     frequency_figure,
     impulse_figure,

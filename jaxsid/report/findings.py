@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from jaxsid.digits import MISSING, TIMES, change, misfit, percent, plural, significant, with_std
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.mechanics.units import units_of
 from jaxsid.report.frame import Block, Card, Cards, Cell, Notice, Section, Table, Tables, Text
 from jaxsid.report.modes import Mode, compared, connecting, modes_of, worst_fits
-from jaxsid.report.numbers import MISSING, TIMES, change, misfit, percent, plural, significant, with_std
 from jaxsid.report.results import MATRICES
 
 NO_MATRICES = (

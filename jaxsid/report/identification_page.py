@@ -1,5 +1,6 @@
 """The page about an identification: findings first, then the evidence."""
 
+from jaxsid.digits import plural, significant
 from jaxsid.identification import Identification
 from jaxsid.mechanics.units import units_of
 from jaxsid.report.evidence import (
@@ -16,7 +17,6 @@ from jaxsid.report.evidence import (
 )
 from jaxsid.report.findings import fit_section, key_findings, matrices_section
 from jaxsid.report.frame import Gallery, Link, Links, Section, Text, page
-from jaxsid.report.numbers import plural, significant
 from jaxsid.report.parameters import parameters_section
 from jaxsid.report.residuals import residual_section
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from jaxsid.digits import MISSING, change, minus, significant
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import LumpedModel
 from jaxsid.mechanics.units import Units, units_of
 from jaxsid.physical.elements import ElementValues
 from jaxsid.records import as_array
 from jaxsid.report.frame import Block, Cell, Gallery, Section, Table, Text, picture
-from jaxsid.report.numbers import MISSING, change, minus, significant
 from jaxsid.report.plots import correlation_figure, parameter_figure
 from jaxsid.report.plots.parameters import STRONG
 

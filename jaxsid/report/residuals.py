@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsid.digits import MISSING, minus, percent, significant
 from jaxsid.identification import Identification
 from jaxsid.pipeline.misses import NEGLIGIBLE, Peaks, cross_peaks, own_peaks
 from jaxsid.report.frame import Cell, Gallery, Notice, Picture, Section, Table, Text, picture
 from jaxsid.report.modes import worst_fits
-from jaxsid.report.numbers import MISSING, minus, percent, significant
 from jaxsid.report.plots import residual_figure
 from jaxsid.report.plots.residuals import COLOURS
 

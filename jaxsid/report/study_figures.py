@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, FuncFormatter
 
-from jaxsid.report.numbers import minus
+from jaxsid.digits import minus
 from jaxsid.report.study_layout import Panel, is_number, kinds, level_text, levels, pooled, relative
 from jaxsid.report.style import (
     BLUE,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxsid.report.numbers import minus
+from jaxsid.digits import minus
 from jaxsid.study.compare import MANY, Level
 from jaxsid.study.summary import Row
 

@@ -4,6 +4,7 @@ import math
 import statistics
 from collections.abc import Sequence
 
+from jaxsid.digits import MISSING, TIMES, percent, plural, significant, with_std
 from jaxsid.report.evidence import software
 from jaxsid.report.frame import (
     Block,
@@ -20,7 +21,6 @@ from jaxsid.report.frame import (
     page,
     picture,
 )
-from jaxsid.report.numbers import MISSING, TIMES, percent, plural, significant, with_std
 from jaxsid.report.study_figures import quantile_figure, spread_figure
 from jaxsid.report.study_layout import (
     Layout,

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from jaxsid.report.numbers import percent
+from jaxsid.digits import percent
 from jaxsid.report.study_layout import failed_share, kinds, named, pooled
 from jaxsid.study.configuration import Study
 from jaxsid.study.engine import Progress

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from jaxsid.report.numbers import minus, power_of_ten
+from jaxsid.digits import minus, power_of_ten
 
 # Okabe and Ito's colours; the page swaps each for a variable that follows light and dark.
 INK, MUTED, GRID, PAPER = "#1d2733", "#66727f", "#dde2e7", "#fefefe"

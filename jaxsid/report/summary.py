@@ -6,11 +6,11 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 
+from jaxsid.digits import MISSING, change, misfit, percent, significant, with_std
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.mechanics.units import units_of
 from jaxsid.report.modes import compared, modes_of, worst_fits
-from jaxsid.report.numbers import MISSING, change, misfit, percent, significant, with_std
 from jaxsid.report.results import MATRICES
 
 SHOWN = 6  # larger matrices are left to the files

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 
+from jaxsid.digits import DASH
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.mechanics.units import units_of
 from jaxsid.report.envelope import envelope
-from jaxsid.report.numbers import DASH
 from jaxsid.report.plots.time import close_look
 from jaxsid.report.style import (
     BLUE,

@@ -6,10 +6,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from jaxsid.checks import require
+from jaxsid.digits import significant
 from jaxsid.identification import Identification
 from jaxsid.mechanics.lumped import second_order
 from jaxsid.mechanics.units import units_of
-from jaxsid.report.numbers import significant
 from jaxsid.report.style import BLUE, INK, ORANGE, label, new_figure, title
 
 ANNOTATED = 6  # larger matrices are coloured only

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
+from jaxsid.digits import minus
 from jaxsid.physical.elements import ElementValues
-from jaxsid.report.numbers import minus
 from jaxsid.report.plots.matrices import SIGNED
 from jaxsid.report.style import BLUE, FONT, INK, MUTED, ORANGE, WIDTH, label, log_scale, new_figure, shortened
 

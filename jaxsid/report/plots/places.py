@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from jaxsid.digits import DASH
 from jaxsid.gap.diagnose import Diagnosis
 from jaxsid.gap.force_map import ForceMap
 from jaxsid.gap.locate import Locations
@@ -14,7 +15,6 @@ from jaxsid.gap.places import Place
 from jaxsid.mechanics.units import Units, units_of
 from jaxsid.report.envelope import envelope
 from jaxsid.report.law import law_along
-from jaxsid.report.numbers import DASH
 from jaxsid.report.plots.time import close_look
 from jaxsid.report.style import (
     BLUE,

@@ -4,10 +4,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxsid.digits import significant
 from jaxsid.identification import Identification
 from jaxsid.mechanics.units import sensor_kinds
 from jaxsid.report.modes import Mode, displacement_shapes, modes_of
-from jaxsid.report.numbers import significant
 from jaxsid.report.style import BLUE, MUTED, ORANGE, label, new_figure, title
 
 NAMED = 12  # sensors beyond this are numbered

@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_fixture import chain
 
+from jaxsid.digits import change, percent, significant, with_std
 from jaxsid.examples.systems import one_dof, rig, three_dof
 from jaxsid.mechanics.lumped import lumped_model
 from jaxsid.mechanics.units import units_of
 from jaxsid.report.envelope import envelope
-from jaxsid.report.numbers import change, percent, significant, with_std
 
 
 def read(text: str) -> float:
