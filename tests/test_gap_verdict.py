@@ -185,6 +185,16 @@ def test_friction_and_hysteresis_need_not_be_as_exact_as_smooth_laws(kind, name)
     assert said(0.5).name == "unknown"
 
 
+@pytest.mark.parametrize(
+    ("likely", "name"), [((B12,), "effect"), ((B23, B12), "effect"), ((B23,), "unknown"), ((), "unknown")]
+)
+def test_a_loop_that_leaves_much_stands_only_where_the_force_acts(likely, name):
+    where = SimpleNamespace(likely=tuple(Place("between", x["between"]) for x in likely))
+    left = closure(math.hypot(0.09, 0.01), recalibrated=math.hypot(0.3, 0.01))
+    tried = causes(ranking(0.0, -500.0, kinds=[("hysteresis", B12), ("end_stop", B23)]), closures=[left])
+    assert verdict_of(examination()._replace(locations=where), tried).name == name
+
+
 def test_a_run_over_other_samples_may_leave_more_where_tests_find_nothing_in_those_seen():
     # most of the gap was that of a wrong number; the law explains half of the rest
     def said(after, places):

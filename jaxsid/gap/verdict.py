@@ -120,7 +120,7 @@ def _unexplained(causes: Causes, found: Examination) -> float:
     more = structure and last.after > allowed
     beyond = more or (found.finding != "parameters" and substantial(last.recalibrated, last.noise_floor))
     # real friction and hysteresis are richer than any law of theirs, which counts where it explains most
-    rough = any(CATALOGUE[x.kind].rubs for x in causes.selected)
+    rough = any(CATALOGUE[x.kind].rubs and _acts_there(x, found) for x in causes.selected)
     gone = last.against_recalibrated if beyond else last.fraction
     if last.unsure > 0 and more:
         gone = fraction(last.recalibrated, last.after, allowed)
@@ -135,6 +135,12 @@ def _unexplained(causes: Causes, found: Examination) -> float:
         idle = causes.bounded and last.after > HARDLY * last.recalibrated
         lapse = USELESS if idle and causes.remaining.share > SPARED * found.null.share else REMAINDER
     return float(lapse + (1 - lapse - MISSED) / (1 + np.exp(STEEP * (gone - enough) / (1 - enough))))
+
+
+def _acts_there(law: Explanation, found: Examination) -> bool:
+    """Whether a law acts where the force on the model most likely does; a loop elsewhere may take any form, too."""
+    where = found.locations
+    return where is None or ends_of(law.place) in {ends_of(p.as_dict()) for p in where.likely}
 
 
 def _allowed(last: Closure, bare: bool) -> float:
