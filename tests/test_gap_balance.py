@@ -119,9 +119,9 @@ def test_its_share_is_that_of_what_it_does_to_the_sensors():
     ("model", "count"),
     [
         (axis(), 1),
-        (axis(drag=0.3), 1),
+        pytest.param(axis(drag=0.3), 1, marks=pytest.mark.slow),
         (axis((("b1", "displacement"), ("b2", "displacement"))), 1),
-        (axis(MIXED), 1),
+        pytest.param(axis(MIXED), 1, marks=pytest.mark.slow),
         pytest.param(axis((("b2", "displacement"), *SPEEDS)), 2, marks=pytest.mark.slow),
         (axis((("b1", "velocity"),)), 0),
     ],

@@ -182,7 +182,8 @@ def test_a_right_model_leaves_noise_of_what_it_has_not_seen(of, windowed):
     np.testing.assert_allclose(rms, 1, atol=0.1)
 
 
-@pytest.mark.parametrize("windowed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("windowed", [False, True])
 def test_steps_are_short_enough_for_a_motion_that_was_not_seen(monkeypatch, windowed):
     """A loop whose memory is slow where the motion is small follows a large one at once."""
     loop = effect("hysteresis", ("ground", "b1"), stiffness=300.0, beta=2e4, gamma=0.0, exponent=1.0)

@@ -56,6 +56,7 @@ def test_numbers_that_fits_made_as_small_as_they_may_be_are_named():
     assert at_the_least(values([1.5, 0.05, 0.05, 0.0501])) == ("b.mass", "c.damping")
 
 
+@pytest.mark.slow
 def test_a_deviation_at_the_least_value_is_said_to_tell_nothing():
     """The first damper has a hundredth of what the model has it."""
     u, right = drive(), chain()

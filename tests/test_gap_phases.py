@@ -47,6 +47,7 @@ def test_a_search_half_a_turn_off_in_one_record_ends_there(bench):
     assert abs(lost.hypothesis.effects[0].parameters["amplitude"]) < 0.7 * FORCE["amplitude"]
 
 
+@pytest.mark.slow
 def test_all_phases_are_found_from_half_a_turn_off(bench):
     _, found = _whole(bench, trapped(), {}, FIRST)
     (effect,), (deviations,) = found.hypothesis.effects, found.deviations

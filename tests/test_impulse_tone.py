@@ -52,10 +52,8 @@ def test_with_noise_the_plain_estimate_is_useless(matrices, least):
     assert error(Direct(solver="exact")([record]).h[1:-1], truth) > least
 
 
-@pytest.mark.parametrize(
-    ("matrices", "most"),
-    [pytest.param(ONE, 0.2, marks=pytest.mark.slow, id="1 DOF"), pytest.param(CHAIN, 0.2, id="3 DOF")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("matrices", "most"), [(ONE, 0.2), (CHAIN, 0.2)], ids=["1 DOF", "3 DOF"])
 def test_with_noise_a_smooth_prior_rescues_what_is_smooth(matrices, most):
     """The prior, not the tone, supplies the rest: right only where the response is as smooth as it says."""
     record, truth = noisy_tone(matrices)

@@ -303,7 +303,8 @@ def test_one_program_for_all_kinds_over_a_batch():
     assert len(traces) == 1
 
 
-@pytest.mark.parametrize("number", [*(pytest.param(i, marks=pytest.mark.slow) for i in (0, 6, 11, 24)), 31])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 6, 11, 24, 31])
 def test_one_and_two_steps_side_by_side_are_those_one_after_the_other(number):
     from jaxsid.mechanics.nonlinear import respond, respond_twice, state_count
     from jaxsid.mechanics.slots import slots_of

@@ -90,6 +90,7 @@ def test_what_not_even_the_structure_determines_is_named():
     assert any("No sensor on b1, b2" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 def test_a_damper_that_would_be_negative_is_left_out():
     """The nominal model has a damper to the ground where the system has none; noise makes it negative for some."""
     system = chain(THREE[0], [*THREE[1], 50.0], THREE[2])

@@ -58,6 +58,7 @@ def test_the_page_of_a_grid(grid):
     assert percent(max(row.failed for row in rows) / 200) in text
 
 
+@pytest.mark.slow
 def test_the_page_of_a_random_sweep(sweep):
     plan, rows = sweep
     text = text_of(study_page(plan, rows))

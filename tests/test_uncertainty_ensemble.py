@@ -40,6 +40,7 @@ def experiment():
 KEY = jax.random.key(7)
 
 
+@pytest.mark.slow
 def test_any_chunk_and_any_start_give_the_same_bits():
     one = experiment()
     whole = ensemble(one, KEY, 70, chunk=1000)
