@@ -6,7 +6,9 @@ from typing import Any, cast
 import pytest
 from gap_helpers import silent
 from test_gap_causes import B12, B23, BENCH, candidate, ranking, refit
+from test_gap_verdict import causes, closure, examination
 
+from jaxsid.gap import causes as module
 from jaxsid.gap import look as look_of
 from jaxsid.gap import null, search
 from jaxsid.gap.look import Look
@@ -55,3 +57,41 @@ def test_one_effect_more_is_looked_for_beside_one(monkeypatch, selected, further
     else:
         assert (found.look, len(found.selected)) == ("again", 2)
     assert asked == ([] if selected == 2 else [("places", ("places", *at.selected))])
+
+
+@pytest.mark.parametrize(
+    ("unlisted", "outrun", "more", "asked", "concluded"),
+    [
+        (False, False, 2, 0, [1]),
+        (False, True, 2, 1, [1, 2]),
+        (False, True, 1, 1, [1]),  # nothing is there
+        (True, False, 2, 1, [2]),
+        (True, True, 1, 1, [1]),  # once is enough
+    ],
+)
+def test_it_is_asked_for_where_shapes_or_other_samples_show_that_something_is_left(
+    monkeypatch, unlisted, outrun, more, asked, concluded
+):
+    first = ranking(0.0)
+    look = SimpleNamespace(clear=True)
+    at = Found(BENCH, cast(Any, look), (first,), first.ranked[:1], refit(0.0))
+    calls, told = [], []
+
+    def beside(at, *_):
+        calls.append(at)
+        return at._replace(selected=at.selected * more)
+
+    def conclusion(at, *_):
+        count = len(at.selected)
+        told.append(count)
+        left = closure(0.05)._replace(unsure=0.001 * outrun)
+        return causes(*[first] * count, closures=[left] * count)
+
+    monkeypatch.setattr(module, "searched", lambda *_: at)
+    monkeypatch.setattr(module, "small_beside", beside)
+    monkeypatch.setattr(module, "_unlisted", lambda at, *_: (Place("body", "b1"),) if unlisted else ())
+    monkeypatch.setattr(module, "_concluded", conclusion)
+    found = module.causes_of(BENCH.model, (), (), examination())
+    assert len(calls) == asked
+    assert told == concluded
+    assert len(found.selected) == concluded[-1]

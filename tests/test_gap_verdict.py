@@ -252,6 +252,9 @@ def test_a_law_that_leaves_more_of_other_samples_than_its_numbers_tell_is_anothe
     seen, left = closure(0.01142, 0.01474, 0.01138), closure(0.01418, 0.02257, 0.01338)
     made = ranking(0.0, -500.0, kinds=[(kind, B12), ("backlash", B23)])
     found = causes(made, closures=[left._replace(unsure=unsure)], seen=seen)
+    assert found.outrun == (unsure == 0.0009)
+    assert not found._replace(places=SimpleNamespace()).outrun
+    assert not found.first(0).outrun
     verdict = verdict_of(examination(), found)
     assert (verdict.name, verdict.outrun) == (name, name == "unknown")
     # what comes near is said, and why it is not the law

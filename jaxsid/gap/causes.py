@@ -77,6 +77,15 @@ class Causes(NamedTuple):
         return self.closures[-1] if not self.selected or shown(self.closures[-1]) else self.seen
 
     @property
+    def outrun(self) -> bool:
+        """Whether tests find nothing in what is left of the samples seen, but more than that is left of the others.
+
+        A drift that the numbers take up as long as they are fitted to it is missed only then.
+        """
+        last = self.closures[-1]
+        return bool(self.selected) and self.places is None and last.unsure > 0 and last.after > last.accounted
+
+    @property
     def most(self) -> str:
         """Words before a figure of the noise."""
         return "at most " if self.bounded else ""
@@ -118,10 +127,29 @@ def causes_of(
     say = progress or (lambda text: None)
     at = searched(model, seen, found, say)
     unlisted = _unlisted(at, found, say)
-    if unlisted and at.look.clear:
+    asked = bool(unlisted) and at.look.clear
+    if asked:
         # what another effect leaves is shown by laws of any shape, too, wherever they are asked
         at = small_beside(at, model, seen, say)
         unlisted = _unlisted(at, found, say)
+    causes = _concluded(at, unlisted, seen, whole, found, say)
+    if asked or not causes.outrun:
+        return causes
+    more = small_beside(at, model, seen, say)
+    if len(more.selected) == len(at.selected):
+        return causes
+    return _concluded(more, _unlisted(more, found, say), seen, whole, found, say)
+
+
+def _concluded(
+    at: Found,
+    unlisted: tuple[Place, ...],
+    seen: Sequence[Record],
+    whole: Sequence[Record],
+    found: Examination,
+    say: Callable[[str], None],
+) -> Causes:
+    """What was found, and how far the gap shrinks."""
     bench, look, rounds, selected = at.bench, at.look, at.rounds, list(at.selected)
     plain = rounds[0].without if rounds else refitted(bench, Hypothesis())
     chosen = plain if at.before is None else at.before

@@ -1,5 +1,6 @@
 """How far the gap shrinks on samples that nothing was chosen or fitted with."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,8 @@ SPREAD = 16  # draws of a model's numbers
 MIDDLE = 0.6745  # of what is normally distributed half lies within so many deviations
 ROUNDS = 8  # of the search for initial states
 CLEAR = 1.5  # a gap over the noise floor from which on more than noise is left
+UNSURE = 2.0  # deviations of a run over unseen samples, for what is not known of the numbers
+LOUDER = 1.03  # noise of those, next to that of the samples seen, that tells nothing against a law
 SHOWN = 0.25  # power of a gap next to that of noise, from which on samples show it
 
 
@@ -66,6 +69,11 @@ class Closure(NamedTuple):
     by_sensor: dict[str, float]
     noise_by_sensor: dict[str, float]
     unsure: float = 0.0
+
+    @property
+    def accounted(self) -> float:
+        """What noise and numbers as far off as they may be leave together."""
+        return math.hypot(LOUDER * self.noise_floor, UNSURE * self.unsure)
 
     def as_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""

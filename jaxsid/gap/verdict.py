@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsid.gap.causes import Causes
-from jaxsid.gap.closure import CLEAR, Closure, fraction, substantial
+from jaxsid.gap.closure import CLEAR, UNSURE, Closure, fraction, substantial
 from jaxsid.gap.examine import Examination
 from jaxsid.gap.locate import located
 from jaxsid.gap.look import slight
@@ -27,8 +27,6 @@ LAPSE = 0.02  # share of cases of the fifth test set in which what explains all,
 # likewise where tests find more than noise in what it leaves, and that is over so much of what the linear model does
 SHRUNK, REMAINDER = 0.25, 0.35
 HARDLY, USELESS = 0.9, 0.75  # 3 of 4 cases, all whose noise was guessed
-UNSURE = 2.0  # deviations of a run over unseen samples, for what is not known of the numbers
-LOUDER = 1.03  # noise of those, next to that of the samples seen, that tells nothing against a law
 SPARED = 0.5  # of what tests found in the samples seen: an effect that leaves them less was of use there
 OTHER = (
     0.9  # likewise of laws that one of another shape surely adds to, 19 of 22, one of the others found since
@@ -152,7 +150,7 @@ def _allowed(last: Closure, bare: bool) -> float:
         return SURE * last.noise_floor
     if last.unsure == 0:
         return CLEAR * last.noise_floor
-    return math.hypot(LOUDER * last.noise_floor, UNSURE * last.unsure)
+    return last.accounted
 
 
 def _at_one_place(selected: tuple[Explanation, ...]) -> list[tuple[Explanation, Explanation]]:
