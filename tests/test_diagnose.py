@@ -74,6 +74,16 @@ def test_probabilities_are_those_of_the_candidates(written):
     assert [x["probability"] for x in others] == sorted((x["probability"] for x in others), reverse=True)
 
 
+def test_the_elements_are_those_of_the_improved_model(cubic, written):
+    of = np.asarray(element_matrices(cubic.model).nominal)
+    given = {x["name"]: x for x in written["elements"]}
+    assert [x["value"] for x in written["elements"]] == pytest.approx(of, rel=1e-12)
+    # a cubic spring left out stiffens its connection
+    without = given["c2.stiffness"]["value_without_effects"]
+    assert abs(without - given["c2.stiffness"]["value"]) > 3 * given["c2.stiffness"]["std"]
+    assert without == pytest.approx(float(cubic.examination.refit.stiffness[1]), rel=1e-12)
+
+
 def test_the_finding_says_numbers_as_the_tables_do(cubic, written):
     told = written["selected"][0]["parameters"]["coefficient"]
     assert f"coefficient {with_std(told['value'], told['std'])} " in cubic.summary[0]

@@ -10,7 +10,7 @@ from jaxsid.compilation import release_programs
 from jaxsid.gap.causes import Causes, causes_of
 from jaxsid.gap.closely import LENGTH, followed_closely
 from jaxsid.gap.closure import Closure
-from jaxsid.gap.examine import Examination, examine
+from jaxsid.gap.examine import Examination, examine, fitted_values
 from jaxsid.gap.experiment import Experiment, experiment_between
 from jaxsid.gap.explain import element_place, elements_by_key
 from jaxsid.gap.held_out import seen_part, usual_end
@@ -33,7 +33,7 @@ from jaxsid.mechanics.effects.catalogue import law_of
 from jaxsid.mechanics.first_order import physical_displacement_velocity
 from jaxsid.mechanics.lumped import LumpedModel, second_order
 from jaxsid.mechanics.units import units_of
-from jaxsid.physical.elements import element_matrices
+from jaxsid.physical.elements import ElementValues, element_matrices
 from jaxsid.records import Record
 
 SURE = 3.0  # standard deviations from which on an element's change is one
@@ -73,8 +73,20 @@ class Diagnosis(NamedTuple):
     @property
     def model(self) -> LumpedModel:
         """The improved model: with the selected effects and refitted numbers."""
-        nothing = self.causes is None or self.verdict == "none"
-        return self.examination.refit if nothing or self.causes is None else self.causes.chosen.model
+        return self.examination.refit if self._fit is None else self._fit.model
+
+    @property
+    def elements(self) -> ElementValues:
+        """The numbers of the improved model's elements."""
+        if self._fit is None:
+            return self.examination.elements
+        elements, fit = element_matrices(self.nominal), self._fit.fit
+        return fitted_values(elements, fit.theta, fit.covariance)
+
+    @property
+    def _fit(self) -> Refit | None:
+        """That of the improved model; None where it is the best linear one."""
+        return None if self.causes is None or self.verdict == "none" else self.causes.chosen
 
     @property
     def far_off(self) -> bool:
@@ -134,11 +146,12 @@ class Diagnosis(NamedTuple):
         return () if self.examination.locations is None else self.examination.locations.maps
 
     def _elements(self) -> list[dict[str, Any]]:
-        values = self.examination.elements
-        columns = (np.asarray(x).tolist() for x in (values.values, values.deviation, values.nominal))
+        """Those of model.toml, and what they would be without effects, where they take up a part of what is missing."""
+        of, linear = self.elements, self.examination.elements
+        columns = (np.asarray(x).tolist() for x in (of.values, of.deviation, of.nominal, linear.values))
         return [
-            {"name": x.name, "value": value, "std": std, "nominal": nominal}
-            for x, value, std, nominal in zip(values.listed, *columns, strict=True)
+            {"name": x.name, "value": value, "std": std, "nominal": nominal, "value_without_effects": alone}
+            for x, value, std, nominal, alone in zip(of.listed, *columns, strict=True)
         ]
 
     def probability(self, x: Explanation) -> float:

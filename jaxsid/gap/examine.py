@@ -16,7 +16,7 @@ from jaxsid.gap.places import places_of
 from jaxsid.gap.recalibrate import Recalibrated, as_given, recalibrated
 from jaxsid.gap.spectra import in_time
 from jaxsid.mechanics.lumped import LumpedModel
-from jaxsid.physical.elements import ElementValues, element_matrices
+from jaxsid.physical.elements import ElementValues, LinearMatrices, element_matrices
 from jaxsid.records import Record, as_array
 
 FAR = 10.0  # times less that a refit leaves, from which on the tolerance may be wrong
@@ -166,23 +166,31 @@ def examine(
         refit=freely.model,
         locations=located(of) if structural and of is not None else None,
         noises=noises,
-        elements=_values(model, freely),
+        elements=fitted_values(element_matrices(model), freely.change, freely.covariance),
         beside=tuple(_beside(nothing, after, number) for number in range(len(records))),
         fit=after,
         scored=of,
     )
 
 
-def _values(model: LumpedModel, fit: Recalibrated) -> ElementValues:
-    """Of the refitted elements; those that cannot vary have no deviation."""
-    elements = element_matrices(model)
-    nominal = np.asarray(elements.nominal)
-    root = np.sqrt(np.diag(fit.covariance))
+def fitted_values(
+    elements: LinearMatrices, change: Float[np.ndarray, " p"], covariance: Float[np.ndarray, "p p"]
+) -> ElementValues:
+    """Of refitted elements; those that cannot vary have no deviation.
+
+    Args:
+        elements: of the nominal model.
+        change: their relative changes first, then what else was fitted.
+        covariance: of these.
+    """
+    nominal, count = np.asarray(elements.nominal), len(elements.listed)
+    covariance = np.asarray(covariance)[:count, :count]
+    root = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return ElementValues(
         elements.listed,
-        as_array(nominal * (1 + fit.change)),
+        as_array(nominal * (1 + np.asarray(change)[:count])),
         as_array(np.abs(nominal) * root),
-        as_array(fit.covariance / root / root[:, None]),
+        as_array(covariance / root / root[:, None]),
         as_array(nominal),
     )
 

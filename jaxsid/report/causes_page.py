@@ -20,7 +20,6 @@ from jaxsid.gap.explain import elements_by_key
 from jaxsid.gap.ranking import key_of
 from jaxsid.gap.words import kind_words, named, place_words, windows_words
 from jaxsid.mechanics.effects.catalogue import law_of
-from jaxsid.physical.elements import element_matrices
 from jaxsid.report.frame import Block, Card, Cell, Gallery, Picture, Section, Table, Text, picture
 from jaxsid.report.plots.causes import before_after_figure, chosen_name, held_out_pairs, spectra_figure
 
@@ -322,23 +321,20 @@ def numbers_section(found: Diagnosis) -> Section:
     Args:
         found: a diagnosis with causes.
     """
-    assert found.causes is not None
-    fit, elements = found.causes.chosen.fit, element_matrices(found.nominal)
-    nominal, alone = np.asarray(elements.nominal), np.asarray(found.examination.elements.values)
-    root = np.sqrt(np.maximum(np.diag(np.asarray(fit.covariance)), 0.0))
+    of, linear = found.elements, found.examination.elements
+    columns = (np.asarray(x).tolist() for x in (of.values, of.deviation, of.nominal, linear.values))
     named_wrong = {key_of(x["kind"], x["place"]) for x in found.selected()}
     wrong_rows = {i for key, own in elements_by_key(found.nominal).items() if key in named_wrong for i in own}
     rows = []
-    for i, element in enumerate(elements.listed):
-        value, std = float(nominal[i] * (1 + fit.theta[i])), float(abs(nominal[i]) * root[i])
-        moved = change(value, float(nominal[i]))
+    for i, (element, value, std, nominal, alone) in enumerate(zip(of.listed, *columns, strict=True)):
+        moved = change(value, nominal)
         rows.append(
             (
                 element.name,
-                significant(float(nominal[i])),
-                with_std(value, std) if nominal[i] else MISSING,
+                significant(nominal),
+                with_std(value, std) if nominal else MISSING,
                 Cell(moved, tone="warning") if i in wrong_rows else moved,
-                significant(float(alone[i])),
+                significant(alone),
             )
         )
     note = (

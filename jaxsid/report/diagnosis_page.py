@@ -109,7 +109,7 @@ def diagnosis_sections(found: Diagnosis) -> tuple[Section, ...]:
         closure_section(found),
         remaining_section(found),
         next_section(found),
-        numbers_section(found) if explained else _numbers(found),
+        numbers_section(found) if explained and found.verdict != "none" else _numbers(found),
         _method(found),
     )
 
